@@ -1,0 +1,48 @@
+"""Shape checks that run while JAX traces, and cost nothing once compiled."""
+
+import jax.numpy as jnp
+
+
+def check_shapes(where, /, **arrays):
+    """Match each array's trailing axes to a spec; raise with the axis's name.
+
+    Args:
+      where: name of the calling function, used in the message.
+      **arrays: `name=(array, "... S C")`. A leading `...` frees the batch axes; a word is an axis that
+        must have one size everywhere; a digit is literal.
+
+    Returns:
+      dict from axis name to size.
+
+    Raises:
+      ValueError: naming the function, the argument, the axis and both sizes.
+    """
+    sizes, first = {}, {}
+    for name, (array, spec) in arrays.items():
+        axes, shape = spec.split(), jnp.shape(array)
+        free = bool(axes) and axes[0] == "..."
+        axes = axes[1:] if free else axes
+        if len(shape) < len(axes) or (len(shape) > len(axes) and not free):
+            raise ValueError(f"{where}: `{name}` should be ({spec}), got shape {shape}.")
+        for axis, size in zip(axes, shape[len(shape) - len(axes) :], strict=True):
+            want = int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
+            if size != want:
+                source = f" from `{first[axis]}`" if axis in first else ""
+                raise ValueError(
+                    f"{where}: axis {axis} of `{name}` is {size}, expected {want}{source} "
+                    f"({name} should be ({spec}), got shape {shape})."
+                )
+            first.setdefault(axis, name)
+    return sizes
+
+
+def check_option(where, /, **options):
+    """Refuse a value that is not one of the listed ones: `check_option("f", head=(head, ("blend", "direct")))`.
+
+    Raises:
+      ValueError: naming the function, the option, the value and the valid ones.
+    """
+    for name, (value, valid) in options.items():
+        if value not in valid:
+            listed = ", ".join(repr(v) for v in valid)
+            raise ValueError(f"{where}: `{name}` is {value!r}, expected one of {listed}.")

@@ -1,0 +1,60 @@
+"""Primitives whose value *and* gradient stay finite where the naive form breaks.
+
+Each is named for what it guarantees; the test beside it goes to the point where the naive form breaks.
+"""
+
+import jax
+import jax.numpy as jnp
+
+HIGHEST = jax.lax.Precision.HIGHEST
+
+
+def exclusive_cumsum(x):
+    """Running sum of the entries before each one, on the last axis; starts at 0.
+
+    Not `cumsum(x) - x`: a large last entry (the reference closes every ray with a 1e10 interval) would
+    absorb the sum it is then subtracted from.
+    """
+    zero = jnp.zeros_like(x[..., :1])
+    return jnp.concatenate([zero, jnp.cumsum(x[..., :-1], axis=-1)], axis=-1)
+
+
+def exclusive_cumprod(x):
+    """Running product of the entries before each one, on the last axis; starts at 1."""
+    ones = jnp.ones_like(x[..., :1])
+    return jnp.cumprod(jnp.concatenate([ones, x[..., :-1]], axis=-1), axis=-1)
+
+
+def safe_norm(x, *, axis=-1, keepdims=False):
+    """Euclidean norm whose gradient at x = 0 is 0 rather than NaN."""
+    squared = jnp.sum(x * x, axis=axis, keepdims=keepdims)
+    positive = squared > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+
+
+def safe_divide(numerator, denominator, *, otherwise=0.0):
+    """numerator / denominator; `otherwise`, with a 0 gradient, where the denominator is 0."""
+    zero = denominator == 0
+    return jnp.where(zero, otherwise, numerator / jnp.where(zero, 1, denominator))
+
+
+def masked_mean(x, mask):
+    """Mean of x where mask is 1; exactly 0, with a 0 gradient, when mask is empty.
+
+    Args:
+      x: any shape; may be non-finite where mask is 0.
+      mask: broadcasts to x; weights in [0, 1].
+    """
+    mask = jnp.broadcast_to(mask, x.shape).astype(x.dtype)
+    count = jnp.sum(mask)
+    return jnp.sum(jnp.where(mask > 0, x, 0) * mask) / jnp.where(count > 0, count, 1)
+
+
+def matvec(matrix, vector):
+    """(..., i, j) x (..., j) -> (..., i) in true float32, on GPUs and TPUs too."""
+    return jnp.einsum("...ij,...j->...i", matrix, vector, precision=HIGHEST)
+
+
+def matmul(a, b):
+    """(..., i, j) x (..., j, k) -> (..., i, k) in true float32, on GPUs and TPUs too."""
+    return jnp.matmul(a, b, precision=HIGHEST)
