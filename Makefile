@@ -1,0 +1,56 @@
+# zestjax: `make test` and `make demo` need only Python 3.11-3.13 and make the virtual environment themselves.
+
+VENV ?= .venv
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
+	$$p -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' >/dev/null 2>&1 \
+	&& echo $$p && break; done)
+RUN = $(VENV)/bin/python
+# Two test workers on two cores: one XLA thread each, or they fight.
+WORKERS ?= 2
+TEST_ENV = PJRT_NPROC=1 OMP_NUM_THREADS=1 MPLBACKEND=Agg
+PYTEST = $(TEST_ENV) $(RUN) -m pytest -q -n $(WORKERS) --dist loadfile
+
+.PHONY: test lint demo bench test-slow test-lowest test-newest clean
+
+$(VENV)/installed: pyproject.toml
+	@test -n "$(PYTHON)" || { echo "error: no Python 3.11-3.13 with venv found; pass PYTHON=/path/to/python" >&2; exit 2; }
+	rm -rf $(VENV)
+	$(PYTHON) -m venv $(VENV)
+	$(RUN) -m pip install -q --upgrade pip
+	$(RUN) -m pip install -q $(CONSTRAINTS) -e '.[dev]'
+	touch $@
+
+test: lint
+	$(PYTEST) -m "not slow"
+
+lint: $(VENV)/installed
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+	$(RUN) -m pyright --pythonpath $(RUN)
+
+demo: $(VENV)/installed
+	$(VENV)/bin/zestjax demo --out runs/demo
+
+bench: $(VENV)/installed
+	for script in experiments/benchmarks/*.py; do $(RUN) $$script || exit 1; done
+
+test-slow: $(VENV)/installed
+	$(PYTEST) -m slow
+
+# The fast suite at the declared lower bounds, and at the newest versions the bounds admit.
+test-lowest:
+	mkdir -p build && $(PYTHON) experiments/lower_bounds.py pyproject.toml > build/lowest.txt
+	$(MAKE) VENV=.venv-lowest CONSTRAINTS="-c build/lowest.txt" .venv-lowest/installed
+	$(MAKE) VENV=.venv-lowest fast
+
+test-newest:
+	rm -rf .venv-newest
+	$(MAKE) VENV=.venv-newest CONSTRAINTS="--upgrade" .venv-newest/installed
+	$(MAKE) VENV=.venv-newest fast
+
+.PHONY: fast
+fast: $(VENV)/installed
+	$(PYTEST) -m "not slow"
+
+clean:
+	rm -rf .venv .venv-lowest .venv-newest build dist runs .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,61 @@
+"""The conventions of the public functions of layers 0-7: options keyword-only, `key` first, documented."""
+
+import importlib
+import inspect
+import pkgutil
+
+import pytest
+
+import zestjax
+
+CORE = [
+    name
+    for _, name, _ in pkgutil.walk_packages(zestjax.__path__, "zestjax.")
+    if name.split(".")[1] not in ("apps", "cli") and "__main__" not in name
+]
+
+
+def public(kind):
+    """(qualified name, object) of the public functions or classes that the core's modules define."""
+    found = {}
+    for name in CORE:
+        module = importlib.import_module(name)
+        for attribute, value in vars(module).items():
+            if not attribute.startswith("_") and kind(value) and getattr(value, "__module__", "") == name:
+                found[f"{name.removeprefix('zestjax.')}.{attribute}"] = value
+    return sorted(found.items())
+
+
+def is_function(value):
+    return callable(value) and not inspect.isclass(value) and inspect.isroutine(inspect.unwrap(value))
+
+
+FUNCTIONS = public(is_function)
+CLASSES = public(inspect.isclass)
+
+
+def test_every_public_function_and_type_is_documented():
+    bare = [name for name, value in FUNCTIONS + CLASSES if not (value.__doc__ or "").strip()]
+    # A NamedTuple without a docstring gets a generated one that repeats its fields.
+    bare += [name for name, value in CLASSES if (value.__doc__ or "").startswith(f"{value.__name__}(")]
+    assert not bare
+
+
+def test_every_module_says_what_it_is():
+    bare = [name for name in CORE if not (importlib.import_module(name).__doc__ or "").strip()]
+    packages = {name for name in CORE if hasattr(importlib.import_module(name), "__path__")}
+    assert not [name for name in bare if name not in packages]
+
+
+@pytest.mark.parametrize("fn", [fn for _, fn in FUNCTIONS], ids=[name for name, _ in FUNCTIONS])
+def test_options_are_keyword_only(fn):
+    """`render(raw, z, d, noise)` cannot land `noise` in `white_background`."""
+    parameters = inspect.signature(inspect.unwrap(fn)).parameters.values()
+    assert not [p.name for p in parameters if p.default is not p.empty and p.kind is not p.KEYWORD_ONLY]
+
+
+@pytest.mark.parametrize("fn", [fn for _, fn in FUNCTIONS], ids=[name for name, _ in FUNCTIONS])
+def test_a_random_function_takes_its_key_first(fn):
+    names = list(inspect.signature(inspect.unwrap(fn)).parameters)
+    assert "key" not in names[1:]
+    assert not {"rng", "rng_key", "prng_key"} & set(names)

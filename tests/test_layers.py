@@ -1,0 +1,63 @@
+"""Imports point down, and one module knows jaxopt."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import zestjax
+
+PACKAGE = Path(zestjax.__file__).parent
+LAYERS = [
+    "numerics checks trees",
+    "cameras video rays resample frustum",
+    "nets planesweep trust cost_volume evidence encoding",
+    "fields",
+    "rendering depth flow presets model",
+    "losses",
+    "schedules solve",
+    "metrics io simulate floors testing novel_view learn training",
+    "apps cli",
+]
+LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names.split()}
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def stage(path):
+    """The top-level module or subpackage a file belongs to."""
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def imported(tree):
+    """Top-level zestjax modules a file imports, anywhere in it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            parts = node.module.split(".")
+            if parts[0] == "zestjax":
+                yield from parts[1:2] or (alias.name for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (a.name.split(".")[1] for a in node.names if a.name.startswith("zestjax."))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_imports_point_down(path):
+    here = stage(path)
+    if here == "__init__":
+        return
+    assert here in LEVEL, f"{here} is in no layer: add it to LAYERS"
+    names = {name for name in imported(ast.parse(path.read_text())) if name != "__version__"}
+    unknown = names - LEVEL.keys()
+    assert not unknown, f"{here} imports modules of no layer: {sorted(unknown)}"
+    above = {name for name in names if LEVEL[name] > LEVEL[here]}
+    assert not above, f"{here} (layer {LEVEL[here]}) imports from above: {sorted(above)}"
+
+
+def test_one_module_knows_jaxopt():
+    knows = []
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            modules = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            modules += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if any(module.split(".")[0] == "jaxopt" for module in modules):
+                knows.append(path.name)
+    assert set(knows) <= {"solve.py"}

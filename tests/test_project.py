@@ -1,0 +1,79 @@
+"""What must hold of the project as a whole: its dependencies, its size, its promises about numbers."""
+
+import ast
+import importlib.util
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FILES = sorted((ROOT / "zestjax").rglob("*.py"))
+TOP_LEVEL = {"zestjax", "experiments", "tests", "pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "Makefile"}
+
+
+def test_optax_is_not_in_the_environment():
+    assert importlib.util.find_spec("optax") is None
+
+
+def test_every_dependency_states_its_lower_bound():
+    sys.path.insert(0, str(ROOT / "experiments"))
+    try:
+        from lower_bounds import lower_bounds
+    finally:
+        sys.path.pop(0)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert any(line.startswith("jaxopt==0.8.5") for line in lower_bounds(project))
+
+
+def test_the_top_level_holds_only_what_the_layout_names():
+    visible = {path.name for path in ROOT.iterdir() if not path.name.startswith(".")}
+    assert visible - {"runs", "build", "dist"} <= TOP_LEVEL
+
+
+def test_numbers_are_made_finite_by_construction_not_afterwards():
+    assert not [path.name for path in FILES if "nan_to_num" in path.read_text()]
+
+
+def test_nothing_is_pickled():
+    pattern = re.compile(r"\bimport pickle|allow_pickle=True")
+    assert not [path.name for path in FILES if pattern.search(path.read_text())]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_modules_and_functions_stay_small(path):
+    text = path.read_text()
+    assert text.count("\n") < 300
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            doc = ast.get_docstring(node)
+            lines = (node.end_lineno or 0) - node.lineno + 1 - (len(doc.splitlines()) + 2 if doc else 0)
+            assert lines <= 40, f"{node.name} has {lines} lines of code"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_only_the_edge_prints_or_reads_arguments(path):
+    if path.relative_to(ROOT / "zestjax").with_suffix("").parts[0] in ("apps", "cli"):
+        return
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            assert node.func.id != "print"
+        if isinstance(node, ast.Import):
+            assert not {"argparse", "logging", "tqdm"} & {alias.name for alias in node.names}
+
+
+def test_the_equation_index_agrees_with_the_docstrings():
+    index = ROOT / "zestjax" / "EQUATIONS.md"
+    if not index.exists():
+        pytest.skip("EQUATIONS.md is not written yet")
+    named = set(re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)`", index.read_text()))
+    missing = []
+    for name in sorted(named):
+        *parts, function = name.split(".")
+        path = ROOT / "zestjax" / "/".join(parts)
+        sources = [path.with_suffix(".py"), path / "__init__.py"]
+        if not any(s.exists() and re.search(rf"^(def|class) {function}\b", s.read_text(), re.M) for s in sources):
+            missing.append(name)
+    assert not missing

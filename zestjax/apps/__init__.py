@@ -1,0 +1,1 @@
+"""What the commands do: loops, files and progress around the pure core."""
