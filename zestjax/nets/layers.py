@@ -1,0 +1,195 @@
+"""Layers that every network here is made of: affine maps, 2-D convolutions, batch statistics with an activation.
+
+Vocabulary:
+  kernel: the weights of a linear map; its last two axes are channels in and channels out.
+  norm-act: centre and scale by the statistics of the batch at hand (never running ones), scale and offset, leaky ReLU.
+
+Parameters are arrays only and float32 unless the caller casts them; what a layer is, is read off their shapes.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from zestjax.checks import check_shapes
+
+SPACES = ("NHWC", "HWIO", "NHWC")
+
+
+class Dense(NamedTuple):
+    """An affine map of the last axis.
+
+    Attributes:
+      kernel: (in, out).
+      bias: (out,).
+    """
+
+    kernel: jax.Array
+    bias: jax.Array
+
+
+class Conv(NamedTuple):
+    """A 2-D or 3-D convolution.
+
+    Attributes:
+      kernel: (size, size, in, out), or (size, size, size, in, out); size odd.
+      bias: (out,), or None where a norm follows.
+    """
+
+    kernel: jax.Array
+    bias: jax.Array | None
+
+
+class Norm(NamedTuple):
+    """What follows the division by the batch's standard deviation.
+
+    Attributes:
+      scale: (C,).
+      offset: (C,).
+    """
+
+    scale: jax.Array
+    offset: jax.Array
+
+
+class Block(NamedTuple):
+    """Convolution, then norm-act.
+
+    Attributes:
+      conv: without a bias, which the norm would remove.
+      norm: its norm.
+    """
+
+    conv: Conv
+    norm: Norm
+
+
+def init_dense(key, n_in, n_out, *, scale=1.0):
+    """A `Dense` with normal kernel of variance 2 scale^2 / n_in (He) and bias 0."""
+    return Dense(jax.random.normal(key, (n_in, n_out)) * (scale * (2 / n_in) ** 0.5), jnp.zeros(n_out))
+
+
+def init_conv2d(key, size, n_in, n_out, *, bias=True):
+    """A 2-D `Conv` of odd `size` with normal kernel of variance 2 / (size^2 n_in); bias 0, or None."""
+    kernel = jax.random.normal(key, (size, size, n_in, n_out)) * (2 / (size**2 * n_in)) ** 0.5
+    return Conv(kernel, jnp.zeros(n_out) if bias else None)
+
+
+def init_conv3d(key, n_in, n_out):
+    """A 3-D `Conv` of size 3 without bias; normal kernel of variance 2 / (27 n_in)."""
+    return Conv(jax.random.normal(key, (3, 3, 3, n_in, n_out)) * (2 / (27 * n_in)) ** 0.5, None)
+
+
+def init_norm(channels):
+    """A `Norm` of scale 1 and offset 0."""
+    return Norm(jnp.ones(channels), jnp.zeros(channels))
+
+
+def init_block2d(key, size, n_in, n_out):
+    """A 2-D `Block`."""
+    return Block(init_conv2d(key, size, n_in, n_out, bias=False), init_norm(n_out))
+
+
+def init_block3d(key, n_in, n_out):
+    """A 3-D `Block` of size 3."""
+    return Block(init_conv3d(key, n_in, n_out), init_norm(n_out))
+
+
+def add_bias(x, bias):
+    """x (..., C) + bias (C,), written as a product with ones so that the gradient's sum is a matrix product too."""
+    ones = jnp.ones((x.size // x.shape[-1], 1), x.dtype)
+    return x + (ones @ bias[None]).reshape(x.shape)
+
+
+def dense(params, x):
+    """x (..., in) @ kernel + bias -> (..., out).
+
+    Raises:
+      ValueError: if the last axis of x is not what the kernel takes.
+    """
+    check_shapes("dense", kernel=(params.kernel, "in out"), x=(x, "... in"))
+    return add_bias(x @ params.kernel, params.bias)
+
+
+def conv2d(params, x, *, stride=1):
+    """Zero-padded convolution x (B, H, W, in) -> (B, ceil(H / stride), ceil(W / stride), out).
+
+    Output pixel j sits on input pixel `stride` j, whatever the (odd) kernel size.
+
+    Args:
+      params: a 2-D `Conv`.
+      x: (B, H, W, in).
+      stride: 1 or 2.
+
+    Raises:
+      ValueError: if the channels of x are not what the kernel takes.
+    """
+    check_shapes("conv2d", kernel=(params.kernel, "size size in out"), x=(x, "B H W in"))
+    if params.kernel.shape[0] == 1 and stride == 1:
+        out = x @ params.kernel[0, 0]
+    else:
+        pad = params.kernel.shape[0] // 2
+        out = lax.conv_general_dilated(x, params.kernel, (stride,) * 2, [(pad, pad)] * 2, dimension_numbers=SPACES)
+    return out if params.bias is None else add_bias(out, params.bias)
+
+
+def norm_act(params, x, *, slope=0.01, instance=False, epsilon=1e-5, legacy_abs=False):
+    """Standardise each channel by its batch's statistics, scale and offset, leaky ReLU; x (..., C) -> (..., C).
+
+    Mean and biased variance (centred, two passes) are over every axis but the last: views of one scene are
+    normalised together.
+
+    Args:
+      params: a `Norm` of C channels.
+      x: (..., C).
+      slope: of the activation below 0.
+      instance: statistics of each element of the leading axis by itself.
+      epsilon: added to the variance.
+      legacy_abs: scale by |scale| + epsilon, as the fused norm that the published weights were trained with does.
+
+    Raises:
+      ValueError: if x does not have C channels.
+    """
+    check_shapes("norm_act", scale=(params.scale, "C"), x=(x, "... C"))
+    scale = jnp.abs(params.scale) + epsilon if legacy_abs else params.scale
+    groups = x.shape[0] if instance else 1
+    flat = x.reshape(groups, -1, x.shape[-1])
+    return _norm_act(slope, epsilon, scale, params.offset, flat).reshape(x.shape)
+
+
+def _mean(x):
+    """Mean over rows, x (G, N, C) -> (G, 1, C), as a product: sums over leading axes are slow on a CPU."""
+    return jnp.full((x.shape[0], 1, x.shape[1]), 1 / x.shape[1], x.dtype) @ x
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _norm_act(slope, epsilon, scale, offset, x):
+    return _norm_act_fwd(slope, epsilon, scale, offset, x)[0]
+
+
+def _norm_act_fwd(slope, epsilon, scale, offset, x):
+    mean = _mean(x)
+    rate = lax.rsqrt(_mean(jnp.square(x - mean)) + epsilon)
+    out = (x - mean) * (rate * scale[None, None]) + offset[None, None]
+    return jnp.where(out > 0, out, slope * out), (scale, offset, x, mean, rate)
+
+
+def _norm_act_bwd(slope, epsilon, saved, d_out):
+    scale, offset, x, mean, rate = saved
+    unit = (x - mean) * rate
+    d_out = jnp.where(unit * scale[None, None] + offset[None, None] > 0, d_out, slope * d_out)
+    d_offset, d_scale = _mean(d_out), _mean(d_out * unit)
+    d_x = (d_out - d_offset - unit * d_scale) * (rate * scale[None, None])
+    rows = x.shape[1]
+    return d_scale.sum((0, 1)) * rows, d_offset.sum((0, 1)) * rows, d_x
+
+
+_norm_act.defvjp(_norm_act_fwd, _norm_act_bwd)
+
+
+def block2d(params, x, *, stride=1, instance=False, legacy_abs=False):
+    """`conv2d`, then `norm_act`."""
+    return norm_act(params.norm, conv2d(params.conv, x, stride=stride), instance=instance, legacy_abs=legacy_abs)
