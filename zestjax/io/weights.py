@@ -1,0 +1,173 @@
+"""Trees of arrays in one safetensors file: no pickle, nothing half-written, nothing altered unnoticed.
+
+A leaf is stored under its path in the tree, `.static.trunk[0].kernel`. The header carries the caller's metadata as JSON
+and a SHA-256 over names, types, shapes, values and that metadata.
+"""
+
+import hashlib
+import json
+import struct
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from zestjax.io.files import write_bytes
+
+_DTYPES = {
+    **{f"F{bits}": np.dtype(f"float{bits}") for bits in (16, 32, 64)},
+    **{f"I{bits}": np.dtype(f"int{bits}") for bits in (8, 16, 32, 64)},
+    **{f"U{bits}": np.dtype(f"uint{bits}") for bits in (8, 16, 32, 64)},
+    "BF16": np.dtype(jnp.bfloat16),
+    "BOOL": np.dtype(bool),
+}
+
+
+class WeightsError(ValueError):
+    """Weights or a checkpoint could not be written, or are not the ones asked for. Names the file and the remedy."""
+
+
+class DamagedFileError(WeightsError):
+    """The file is truncated, was altered after it was written, or is no weights file."""
+
+
+def save_weights(path, params, *, metadata):
+    """Write a tree of arrays and its metadata to one file, atomically.
+
+    Args:
+      path: the file; an earlier one is replaced only once the new one is complete.
+      params: pytree of arrays; PRNG keys, bfloat16 and scalars keep their types.
+      metadata: dict of what JSON can hold; the full configuration belongs here.
+
+    Raises:
+      WeightsError: the disk is full or the place not writable; an earlier file is unchanged, no part of the new left.
+    """
+    arrays = {name: _to_numpy(leaf) for name, leaf in _named_leaves(params)}
+    text = json.dumps(metadata, sort_keys=True)
+    header = {"format": "zestjax", "metadata": text, "sha256": _digest(arrays, text)}
+    try:
+        write_bytes(path, safetensors.numpy.save(arrays, metadata=header))
+    except OSError as error:
+        raise WeightsError(
+            f"{path}: could not be written ({error.strerror or error}); free some space or choose another place. "
+            "Nothing was changed there."
+        ) from error
+
+
+def load_weights(path, like=None):
+    """Read what `save_weights` wrote.
+
+    Args:
+      path: the file.
+      like: tree of arrays or `jax.ShapeDtypeStruct`s of the wanted structure, shapes and types; None returns a flat
+        dict from leaf path to numpy array instead.
+
+    Returns:
+      (params, metadata): the tree of jax arrays with the structure of `like`, and the dict given to `save_weights`.
+
+    Raises:
+      DamagedFileError: truncated, altered, or not a file of this kind.
+      WeightsError: no such file; or its leaves are not those of `like` (all differences are listed).
+    """
+    arrays, metadata = _read(Path(path))
+    if like is None:
+        return arrays, metadata
+    wanted = _named_leaves(like)
+    differences = _differences(arrays, wanted)
+    if differences:
+        shown = "; ".join(differences[:8]) + (f"; and {len(differences) - 8} more" if len(differences) > 8 else "")
+        raise WeightsError(
+            f"{path}: holds weights of another model or preset: {shown}. "
+            "Use the preset that its metadata names, or other weights."
+        )
+    leaves = [_from_numpy(arrays[name], leaf) for name, leaf in wanted]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves), metadata
+
+
+def read_metadata(path):
+    """The metadata dict of a weights file, verified as by `load_weights`.
+
+    Raises:
+      WeightsError: as `load_weights`.
+    """
+    return load_weights(path)[1]
+
+
+def _named_leaves(tree):
+    """[(path in the tree, leaf)] in the tree's order."""
+    return [(jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]]
+
+
+def _is_key(leaf):
+    return hasattr(leaf, "dtype") and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _to_numpy(leaf):
+    """A contiguous array: safetensors stores the memory as it lies."""
+    array = np.asarray(
+        jax.random.key_data(leaf) if _is_key(leaf) else leaf if hasattr(leaf, "dtype") else jnp.asarray(leaf)
+    )
+    return np.ascontiguousarray(array).reshape(array.shape)
+
+
+def _from_numpy(array, leaf):
+    if _is_key(leaf):
+        implementations = []
+        jax.eval_shape(lambda key: implementations.append(jax.random.key_impl(key)), leaf)
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=implementations[0])
+    return jnp.asarray(array)
+
+
+def _differences(arrays, wanted):
+    """Sentences on how the stored arrays differ from the wanted leaves; empty when they match."""
+    names = [name for name, _ in wanted]
+    found = [f"`{name}` is missing" for name in names if name not in arrays]
+    found += [f"`{name}` is not wanted" for name in arrays if name not in set(names)]
+    for name, leaf in wanted:
+        if name in arrays:
+            spec = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
+            have, want = arrays[name], (np.shape(spec), np.result_type(spec))
+            if (have.shape, have.dtype) != want:
+                found.append(f"`{name}` is {have.dtype} {have.shape}, expected {want[1]} {want[0]}")
+    return found
+
+
+def _digest(arrays, text):
+    """SHA-256 over everything that must not change, in the order of the names."""
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"\n{name} {array.dtype.name} {array.shape}\n".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _read(path):
+    """The stored arrays by name and the metadata, verified."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise WeightsError(f"{path}: could not be read ({error.strerror or error}); check the path.") from error
+    try:
+        (length,) = struct.unpack("<Q", content[:8])
+        header = json.loads(content[8 : 8 + length]).get("__metadata__", {})
+        stored = dict(safetensors.deserialize(content))
+        arrays = {
+            name: np.frombuffer(entry["data"], _DTYPES[entry["dtype"]]).reshape(entry["shape"])
+            for name, entry in stored.items()
+        }
+    except (struct.error, ValueError, KeyError, AttributeError, safetensors.SafetensorError) as error:
+        raise DamagedFileError(
+            f"{path}: is truncated or not a safetensors file ({len(content)} bytes); copy or write it again."
+        ) from error
+    text = header.get("metadata")
+    if header.get("format") != "zestjax" or text is None:
+        raise DamagedFileError(f"{path}: is a safetensors file that zestjax did not write; give weights that it wrote.")
+    if header.get("sha256") != _digest(arrays, text):
+        raise DamagedFileError(
+            f"{path}: was altered after it was written (its checksum differs); copy or write it again."
+        )
+    return arrays, json.loads(text)

@@ -1,0 +1,171 @@
+"""How close a picture, a depth or a flow is to the truth.
+
+Pure functions of one image each, differentiable and ready for `jax.jit` and `jax.vmap`. A mask (H, W) chooses the
+pixels that count, as booleans or as weights in [0, 1]; where it is empty there is nothing to score and the result is
+NaN, which a report writes as null.
+
+    H W      rows and columns
+    C        channels, 3 for RGB
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from zestjax.checks import check_shapes
+
+PSNR_CAP = 100.0
+"""dB given to identical images, whose PSNR is infinite: no 8-bit image that differs at all reaches it."""
+
+SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
+
+
+def psnr(image, truth, *, mask=None):
+    """Peak signal-to-noise ratio in dB for values in [0, 1], at most `PSNR_CAP`.
+
+    Args:
+      image: (H, W, C) scored picture.
+      truth: (H, W, C) what it should be.
+      mask: (H, W) or None for every pixel.
+
+    Returns:
+      () dB; NaN when the mask is empty.
+
+    Raises:
+      ValueError: shapes do not match.
+    """
+    check_shapes("psnr", image=(image, "H W C"), truth=(truth, "H W C"))
+    error = _mean_where(jnp.mean((image - truth) ** 2, axis=-1), mask, where="psnr")
+    return -10 * jnp.log10(jnp.maximum(error, 10 ** (-PSNR_CAP / 10)))
+
+
+def ssim(image, truth, *, mask=None):
+    """Mean structural similarity: see `ssim_map`. The 5 outer pixels, whose windows leave the image, do not count.
+
+    Args:
+      image: (H, W, C), H and W at least 11.
+      truth: (H, W, C).
+      mask: (H, W) or None for every pixel.
+
+    Returns:
+      () in [-1, 1]; NaN when the mask has no pixel 5 or more away from the border.
+
+    Raises:
+      ValueError: shapes do not match, or the image is smaller than the window.
+    """
+    similarity = jnp.mean(ssim_map(image, truth), axis=-1)
+    inside = slice(SSIM_RADIUS, -SSIM_RADIUS)
+    if mask is not None:
+        check_shapes("ssim", image=(similarity, "H W"), mask=(mask, "H W"))
+        mask = mask[inside, inside]
+    return _mean_where(similarity[inside, inside], mask, where="ssim")
+
+
+def ssim_map(image, truth):
+    """Structural similarity of every pixel and channel for values in [0, 1].
+
+    Gaussian window 11 x 11 of sigma 1.5, images mirrored at the border, biased variances. Variances are centred in each
+    window, first along the rows and then across them, so that a flat patch has variance 0 and not rounding.
+
+    Source: Wang et al. 2004, eq. 13; the settings are the paper's own (Gaussian weights, K1 = 0.01, K2 = 0.03).
+    Differs from the reference: the released ZeST-NeRF code averages a window of 5.
+
+    Args:
+      image: (H, W, C), H and W at least 11.
+      truth: (H, W, C).
+
+    Returns:
+      (H, W, C) in [-1, 1].
+
+    Raises:
+      ValueError: shapes do not match, or the image is smaller than the window.
+    """
+    sizes = check_shapes("ssim", image=(image, "H W C"), truth=(truth, "H W C"))
+    if min(sizes["H"], sizes["W"]) < 2 * SSIM_RADIUS + 1:
+        raise ValueError(
+            f"ssim: `image` is {sizes['H']} x {sizes['W']}, expected at least 11 x 11, the size of the window."
+        )
+    zero = jnp.zeros_like(image)
+    moments = (image, truth, zero, zero, zero)
+    for axis in (1, 0):
+        moments = _window_moments(moments, axis)
+    mean_a, mean_b, variance_a, variance_b, covariance = moments
+    c1, c2 = 0.01**2, 0.03**2
+    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
+    return luminance * (2 * covariance + c2) / (variance_a + variance_b + c2)
+
+
+def depth_abs_rel(depth, truth, mask):
+    """Mean of |depth - truth| / truth over the mask, of pixels whose true depth is finite and > 0.
+
+    Args:
+      depth: (H, W) world units.
+      truth: (H, W) on the same scale.
+      mask: (H, W) or None for every pixel.
+
+    Returns:
+      (); NaN when no pixel counts.
+
+    Raises:
+      ValueError: shapes do not match.
+    """
+    check_shapes("depth_abs_rel", depth=(depth, "H W"), truth=(truth, "H W"))
+    known = jnp.isfinite(truth) & (truth > 0)
+    relative = jnp.abs(depth - jnp.where(known, truth, 1)) / jnp.where(known, truth, 1)
+    mask = known if mask is None else known * jnp.asarray(mask, depth.dtype)
+    return _mean_where(relative, mask, where="depth_abs_rel")
+
+
+def endpoint_error(flow, truth, mask):
+    """Mean length of the difference of two optical flows over the mask, of pixels whose true flow is finite.
+
+    Args:
+      flow: (H, W, 2) pixels.
+      truth: (H, W, 2) pixels.
+      mask: (H, W) or None for every pixel.
+
+    Returns:
+      () pixels; NaN when no pixel counts.
+
+    Raises:
+      ValueError: shapes do not match.
+    """
+    check_shapes("endpoint_error", flow=(flow, "H W 2"), truth=(truth, "H W 2"))
+    known = jnp.all(jnp.isfinite(truth), axis=-1)
+    error = jnp.linalg.norm(flow - jnp.where(known[..., None], truth, 0), axis=-1)
+    mask = known if mask is None else known * jnp.asarray(mask, flow.dtype)
+    return _mean_where(error, mask, where="endpoint_error")
+
+
+def _window_moments(moments, axis):
+    """Means, variances and covariance of a window from those of its parts along one axis (law of total variance)."""
+    offsets = np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
+    taps = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
+    taps = [float(tap) for tap in taps / taps.sum()]
+    parts = [_shifts(moment, axis) for moment in moments]
+    mean_a = sum(tap * part for tap, part in zip(taps, parts[0], strict=True))
+    mean_b = sum(tap * part for tap, part in zip(taps, parts[1], strict=True))
+    variance_a = variance_b = covariance = 0.0
+    for tap, a, b, within_a, within_b, within_ab in zip(taps, *parts, strict=True):
+        variance_a = variance_a + tap * (within_a + (a - mean_a) ** 2)
+        variance_b = variance_b + tap * (within_b + (b - mean_b) ** 2)
+        covariance = covariance + tap * (within_ab + (a - mean_a) * (b - mean_b))
+    return mean_a, mean_b, variance_a, variance_b, covariance
+
+
+def _shifts(x, axis):
+    """The 11 translates of x (H, W, C) along an axis, mirrored at the border (the edge pixel is repeated)."""
+    padding = [(SSIM_RADIUS, SSIM_RADIUS) if i == axis else (0, 0) for i in range(x.ndim)]
+    padded, size = jnp.pad(x, padding, mode="symmetric"), x.shape[axis]
+    take = lambda start: padded[start : start + size] if axis == 0 else padded[:, start : start + size]
+    return [take(start) for start in range(2 * SSIM_RADIUS + 1)]
+
+
+def _mean_where(x, mask, *, where):
+    """Mean of x (H, W) under the mask, None for all; NaN when it is empty. x may be non-finite outside the mask."""
+    if mask is None:
+        return jnp.mean(x)
+    check_shapes(where, image=(x, "H W"), mask=(mask, "H W"))
+    mask = jnp.asarray(mask, x.dtype)
+    count = jnp.sum(mask)
+    total = jnp.sum(jnp.where(mask > 0, x, 0) * mask)
+    return jnp.where(count > 0, total / jnp.where(count > 0, count, 1), jnp.nan)
