@@ -1,0 +1,1 @@
+"""Losses: unweighted scalar means, one module for each kind; `objective` is where they meet their weights."""

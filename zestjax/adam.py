@@ -1,0 +1,106 @@
+"""Adam as pure functions: the arithmetic behind `solve.Adam`.
+
+params   tree of float arrays
+grads    tree like the params
+moments  trees like the params in at least float32
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class AdamState(NamedTuple):
+    """iter_num: () int, updates tried. skipped: () int, those left out because value or gradient was not finite.
+    value: () objective before the last update. error: () L2 norm of its gradient, before clipping.
+    mean, square: moments of the gradient. aux: whatever the objective returned beside its value."""
+
+    iter_num: jax.Array
+    skipped: jax.Array
+    value: jax.Array
+    error: jax.Array
+    mean: Any
+    square: Any
+    aux: Any
+
+
+def moment_dtype(x):
+    """float64 for float64 arrays, float32 for all others."""
+    return jnp.float64 if x.dtype == jnp.float64 else jnp.float32
+
+
+def init_adam(params, *, value_dtype=None, aux=None):
+    """The state before the first update.
+
+    Args:
+      params: tree of float arrays.
+      value_dtype: of the objective; None takes the moments'.
+      aux: what the state holds until the first update: zeros of the objective's aux where the state's structure
+        must not change (`jax.lax.scan`).
+
+    Returns:
+      `AdamState`; no two leaves share a buffer, so it may be donated.
+    """
+    zeros = lambda: jax.tree.map(lambda p: jnp.zeros(p.shape, moment_dtype(p)), params)
+    count = lambda: jnp.zeros((), jnp.int32)
+    double = any(p.dtype == jnp.float64 for p in jax.tree.leaves(params))
+    scalar = jnp.float64 if double else jnp.float32
+    return AdamState(
+        iter_num=count(),
+        skipped=count(),
+        value=jnp.full((), jnp.inf, value_dtype or scalar),
+        error=jnp.full((), jnp.inf, scalar),
+        mean=zeros(),
+        square=zeros(),
+        aux=aux,
+    )
+
+
+def global_norm(tree, *, dtype=jnp.float32):
+    """L2 norm over all leaves; it neither overflows nor vanishes where the entries are finite and not 0."""
+    leaves = [jnp.asarray(x).astype(dtype) for x in jax.tree.leaves(tree)]
+    largest = jnp.max(jnp.stack([jnp.max(jnp.abs(x), initial=0) for x in leaves]))
+    unit = jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1)
+    return unit * jnp.sqrt(sum(jnp.sum((x / unit) ** 2) for x in leaves))
+
+
+def adam(params, state, grads, value, *, rate, b1=0.9, b2=0.999, eps=1e-8, clip_norm=None, skip=True, aux=None):
+    """One update.
+
+    Source: Adam (Kingma and Ba 2015), algorithm 1.
+
+    Args:
+      params: tree of float arrays.
+      state: `AdamState`.
+      grads: tree like `params`, of the objective at `params`.
+      value: () the objective there, for the state and for the test of finiteness.
+      rate: () learning rate of this update.
+      b1: decay of the first moment.
+      b2: decay of the second.
+      eps: added to the root of the second.
+      clip_norm: a gradient with a larger L2 norm is scaled down to it; None never.
+      skip: leave params and moments as they are, and count it, when the value or the gradient is not finite.
+      aux: kept in the state.
+
+    Returns:
+      (params, state).
+    """
+    norm = global_norm(grads, dtype=state.error.dtype)
+    good = jnp.isfinite(norm) & jnp.isfinite(value) if skip else jnp.bool_(True)
+    scale = 1.0 if clip_norm is None else clip_norm / jnp.maximum(norm, clip_norm)
+    count = state.iter_num - state.skipped + 1
+
+    def leaf(p, g, m, v):
+        cast = lambda x: jnp.asarray(x).astype(m.dtype)
+        g = cast(g) * cast(scale)
+        mean, square = b1 * m + (1 - b1) * g, b2 * v + (1 - b2) * g**2
+        debiased = lambda x, b: x / (1 - cast(b) ** cast(count))
+        change = cast(rate) * debiased(mean, b1) / (jnp.sqrt(debiased(square, b2)) + eps)
+        keep = lambda new, old: jnp.where(good, new, old)
+        return keep((cast(p) - change).astype(p.dtype), p), keep(mean, m), keep(square, v)
+
+    stepped = jax.tree.map(leaf, params, grads, state.mean, state.square)
+    params, mean, square = jax.tree.transpose(jax.tree.structure(params), jax.tree.structure((0, 0, 0)), stepped)
+    left_out = jnp.where(good, 0, 1).astype(state.skipped.dtype)
+    return params, AdamState(state.iter_num + 1, state.skipped + left_out, jnp.asarray(value), norm, mean, square, aux)

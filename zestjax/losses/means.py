@@ -1,0 +1,81 @@
+"""The one way in which losses average.
+
+    residual    any shape; may be non-finite where it is not valid
+    confidence  in [0, 1], predicted: scales a residual, and gradients flow into it
+    valid       in [0, 1], data: what is 0 counts in nothing (a missing neighbour, a masked pixel)
+
+Masks are aligned with the residual from the left: axis i of a mask is axis i of the residual, and the
+residual's further axes share its value. A norm printed in the paper is a mean over components here, as in the
+released code, so that the published weights keep their meaning.
+"""
+
+import jax.numpy as jnp
+
+from zestjax.checks import check_option
+from zestjax.numerics import masked_mean
+
+NORMS = ("absolute", "squared")
+NORMALISERS = ("count", "confidence")
+
+
+def spread_mask(where, name, mask, shape):
+    """A mask with the leading axes of `shape`, broadcast to it; None is all ones.
+
+    Args:
+      where: name of the calling function, for the message.
+      name: name of the argument.
+      mask: leading axes of `shape` (an axis may be 1), or None.
+      shape: the residual's.
+
+    Returns:
+      an array that broadcasts against `shape`.
+
+    Raises:
+      ValueError: naming the function, the argument and both shapes.
+    """
+    if mask is None:
+        return jnp.ones((1,) * len(shape), bool)
+    mask = jnp.asarray(mask)
+    missing = len(shape) - mask.ndim
+    if missing < 0 or any(a not in (1, b) for a, b in zip(mask.shape, shape, strict=False)):
+        raise ValueError(
+            f"{where}: `{name}` of shape {mask.shape} does not cover the leading axes of a residual of shape {shape}."
+        )
+    return mask.reshape(mask.shape + (1,) * missing)
+
+
+def residual_norm(where, residual, norm):
+    """|residual| or residual^2, elementwise.
+
+    Raises:
+      ValueError: if `norm` is neither "absolute" nor "squared".
+    """
+    check_option(where, norm=(norm, NORMS))
+    return jnp.abs(residual) if norm == "absolute" else residual**2
+
+
+def mean_over_valid(where, cost, *, valid=None, confidence=None, normalise="count"):
+    """Mean of confidence * cost over what is valid; exactly 0, with a 0 gradient, when nothing is.
+
+    Args:
+      where: name of the calling loss, for messages.
+      cost: the residual's norm, any shape.
+      valid: leading axes of `cost`, or None.
+      confidence: leading axes of `cost`, or None.
+      normalise: "count" divides by the number of valid entries; "confidence" by the sum of confidences
+        (the released code's), so that the gradient reaches the confidence through both.
+
+    Returns:
+      () scalar.
+
+    Raises:
+      ValueError: if a mask's shape does not fit or `normalise` is unknown.
+    """
+    check_option(where, normalise=(normalise, NORMALISERS))
+    mask = spread_mask(where, "valid", valid, cost.shape).astype(cost.dtype)
+    if confidence is None:
+        return masked_mean(cost, mask)
+    confidence = spread_mask(where, "confidence", confidence, cost.shape).astype(cost.dtype)
+    if normalise == "confidence":
+        return masked_mean(cost, mask * confidence)
+    return masked_mean(jnp.where(mask > 0, cost, 0) * confidence, mask)

@@ -1,0 +1,289 @@
+"""Solvers: Adam with jaxopt's stochastic-solver interface, and jaxopt's own on the same objective.
+
+The one module that imports jaxopt, which is no longer developed: the way out stays short.
+
+    objective   `objective(params, batch, weights) -> (total, terms)`, from `losses.objective.make_objective`
+    params      tree of float arrays
+    batch       tree, passed through
+    weights     `Terms`; Python numbers stay static, so that a weight of 0 keeps its term out of the program
+"""
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from zestjax.adam import adam, global_norm, init_adam
+from zestjax.checks import check_option
+
+with warnings.catch_warnings():
+    warnings.filterwarnings("ignore", "JAXopt is no longer", DeprecationWarning)
+    import jaxopt
+    from jaxopt.base import OptStep, StochasticSolver
+
+
+class Fit(NamedTuple):
+    """params: like the initial ones. terms: losses at the last evaluation. grad_norm: () L2 at it.
+    steps: () int. converged: () bool, grad_norm <= tol."""
+
+    params: Any
+    terms: Any
+    grad_norm: jax.Array
+    steps: jax.Array
+    converged: jax.Array
+
+
+@dataclasses.dataclass(eq=False)
+class Adam(StochasticSolver):
+    """Adam (Kingma and Ba 2015, algorithm 1) as a jaxopt stochastic solver.
+
+    Source: ZeST-NeRF section 4.1 (5e-4, the published rate).
+
+    Attributes:
+      fun: `fun(params, *args, **kwargs) -> value`, or `(value, aux)` with `has_aux`; None if only `apply` is used.
+      learning_rate: float, or a function of the step (from 0) such as a `schedules.cosine`.
+      b1, b2, eps: decay of the two moments, and what is added to the root of the second.
+      clip_norm: gradients with a larger L2 norm are scaled down to it; None never.
+      skip_nonfinite: leave params and moments as they are when the value or the gradient is not finite, and count it.
+      maxiter, tol: `run` stops after so many updates or at this gradient norm.
+      value_and_grad: `fun` returns the gradient too.
+      verbose, jit, unroll, implicit_diff, implicit_diff_solve: jaxopt's.
+
+    A new solver is a new program: make one and keep it. jaxopt's `run_iterator` uses its first batch only to
+    initialise. `update` does not donate its inputs: inside your own jit, with `donate_argnums`, it may.
+    """
+
+    fun: Callable | None = None
+    learning_rate: Any = 5e-4
+    b1: float = 0.9
+    b2: float = 0.999
+    eps: float = 1e-8
+    clip_norm: float | None = None
+    skip_nonfinite: bool = True
+    has_aux: bool = False
+    value_and_grad: bool = False
+    maxiter: int = 500
+    tol: float = 0.0
+    verbose: bool = False
+    jit: bool = True
+    unroll: Any = "auto"
+    implicit_diff: bool = False
+    implicit_diff_solve: Callable | None = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.reference_signature = self.fun
+
+    def _value_and_grad(self, params, *args, **kwargs):
+        """((value, aux), gradient)."""
+        if self.fun is None:
+            raise ValueError("Adam: `fun` is None; give a function to minimise, or call `apply` with gradients.")
+        if self.value_and_grad:
+            value, grads = self.fun(params, *args, **kwargs)
+            return (value if self.has_aux else (value, None)), grads
+        pair = self.fun if self.has_aux else lambda *a, **k: (self.fun(*a, **k), None)  # type: ignore[misc]
+        return jax.value_and_grad(pair, has_aux=True)(params, *args, **kwargs)
+
+    def init_state(self, init_params, *args, **kwargs):
+        """The state before the first update; `aux` is zeros of its shape if `fun`'s arguments are given, else None."""
+        if self.fun is None or not (args or kwargs):
+            return init_adam(init_params)
+        (value, shapes), _ = jax.eval_shape(self._value_and_grad, init_params, *args, **kwargs)
+        aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+        return init_adam(init_params, value_dtype=value.dtype, aux=aux)
+
+    def update(self, params, state, *args, **kwargs):
+        """One step on `fun(params, *args, **kwargs)`; returns jaxopt's `OptStep(params, state)`."""
+        (value, aux), grads = self._value_and_grad(params, *args, **kwargs)
+        return self.apply(params, state, grads, value, aux=aux)
+
+    def apply(self, params, state, grads, value, *, aux=None):
+        """One step with a gradient already at hand.
+
+        Args:
+          params: tree of float arrays.
+          state: `AdamState`, from `init_state` or the last step.
+          grads: tree like `params`.
+          value: () objective at `params`, for the state and for the finiteness test.
+          aux: kept in the state.
+
+        Returns:
+          `OptStep(params, state)`.
+        """
+        params, state = adam(
+            params,
+            state,
+            grads,
+            value,
+            rate=self.learning_rate(state.iter_num) if callable(self.learning_rate) else self.learning_rate,
+            b1=self.b1,
+            b2=self.b2,
+            eps=self.eps,
+            clip_norm=self.clip_norm,
+            skip=self.skip_nonfinite,
+            aux=aux,
+        )
+        return OptStep(params=params, state=state)
+
+    def optimality_fun(self, params, *args, **kwargs):
+        """The gradient, which is 0 at a solution: what jaxopt differentiates implicitly."""
+        return self._value_and_grad(params, *args, **kwargs)[1]
+
+
+def fit_lbfgs(objective, params, batch, weights, *, max_steps=100, tol=1e-4, history=10, linesearch="backtracking"):
+    """Minimise `objective` over `params` with L-BFGS: the last mile, on a batch that does not change.
+
+    May be `vmap`ped over batches or arrays of weights. Not differentiable in reverse.
+
+    Args:
+      objective: see the header.
+      params: of one dtype.
+      batch: passed through.
+      weights: see the header.
+      max_steps: stop after this many.
+      tol: stop at this L2 gradient norm.
+      history: gradients kept; memory is 2 * history times the params.
+      linesearch: "backtracking" (compiles fast), "zoom" or "hager-zhang".
+
+    Returns:
+      `Fit`. Running out of steps is reported in `converged`, not raised: a raise cannot cross `vmap`.
+
+    Raises:
+      ValueError: if `linesearch` is unknown.
+    """
+    check_option("fit_lbfgs", linesearch=(linesearch, ("backtracking", "zoom", "hager-zhang")))
+    solver = jaxopt.LBFGS(
+        fun=lambda p, data: objective(p, data, weights),
+        has_aux=True,
+        maxiter=max_steps,
+        tol=tol,
+        history_size=history,
+        linesearch=linesearch,
+        implicit_diff=False,
+        unroll=False,
+    )
+    return _run(solver, params, batch, tol)
+
+
+def fit_gradient(objective, params, batch, weights, *, max_steps=500, tol=1e-4, stepsize=0.0, acceleration=True):
+    """Minimise `objective` over `params` by gradient descent with a line search.
+
+    Args:
+      objective: see the header.
+      params: of one dtype.
+      batch: passed through.
+      weights: see the header.
+      max_steps: stop after this many.
+      tol: stop at this L2 gradient norm.
+      stepsize: 0 searches for it each step.
+      acceleration: Nesterov's.
+
+    Returns:
+      `Fit`; not differentiable in reverse.
+    """
+    solver = jaxopt.GradientDescent(
+        fun=lambda p, data: objective(p, data, weights),
+        has_aux=True,
+        maxiter=max_steps,
+        tol=tol,
+        stepsize=stepsize,
+        acceleration=acceleration,
+        implicit_diff=False,
+        unroll=False,
+    )
+    return _run(solver, params, batch, tol)
+
+
+def fit_adam(objective, params, batches, weights, *, learning_rate=5e-4, clip_norm=1.0, tol=0.0):
+    """One pass of `Adam` over `batches`, in one compiled loop.
+
+    Args:
+      objective: see the header.
+      params: see the header.
+      batches: tree whose leaves have a leading axis, one entry a step.
+      weights: see the header.
+      learning_rate: see `Adam`.
+      clip_norm: see `Adam`.
+      tol: gradient norm that counts as converged; the pass does not stop there.
+
+    Returns:
+      `Fit`.
+    """
+    solver = Adam(
+        fun=lambda p, data: objective(p, data, weights), has_aux=True, learning_rate=learning_rate, clip_norm=clip_norm
+    )
+    return _pass(solver, params, batches, tol)
+
+
+def fit_armijo(objective, params, batches, weights, *, max_stepsize=1.0, tol=0.0):
+    """One pass of jaxopt's `ArmijoSGD` over `batches`: no learning rate to choose, 2-4 evaluations a step.
+
+    Args:
+      objective: see the header.
+      params: of one dtype.
+      batches: tree whose leaves have a leading axis, one entry a step.
+      weights: see the header.
+      max_stepsize: where the line search starts.
+      tol: gradient norm that counts as converged; the pass does not stop there.
+
+    Returns:
+      `Fit`.
+    """
+    solver = jaxopt.ArmijoSGD(
+        fun=lambda p, data: objective(p, data, weights), has_aux=True, max_stepsize=max_stepsize, implicit_diff=False
+    )
+    return _pass(solver, params, batches, tol)
+
+
+def fit_least_squares(residual, params, *args, method="levenberg_marquardt", max_steps=50, tol=1e-6):
+    """Minimise the sum of squares of `residual(params, *args)`: poses, alignments, few parameters.
+
+    Args:
+      residual: `residual(params, *args) -> ` tree of arrays, flattened and joined.
+      params: tree of float arrays of one dtype.
+      *args: passed through.
+      method: "levenberg_marquardt" (solved by QR: finite when the Jacobian is rank deficient) or "gauss_newton".
+      max_steps: stop after this many.
+      tol: stop at this L2 gradient norm.
+
+    Returns:
+      `Fit`; `terms` is the residual at the end.
+
+    Raises:
+      ValueError: if `method` is unknown.
+    """
+    check_option("fit_least_squares", method=(method, ("levenberg_marquardt", "gauss_newton")))
+    flat, unravel = ravel_pytree(params)
+    options: dict[str, Any] = dict(
+        residual_fun=lambda x: ravel_pytree(residual(unravel(x), *args))[0],
+        maxiter=max_steps,
+        tol=tol,
+        implicit_diff=False,
+        unroll=False,
+    )
+    if method == "levenberg_marquardt":
+        solver = jaxopt.LevenbergMarquardt(solver="qr", **options)
+    else:
+        solver = jaxopt.GaussNewton(**options)
+    flat, state = solver.run(flat)
+    at_end, pullback = jax.vjp(options["residual_fun"], flat)
+    norm = global_norm(pullback(at_end)[0], dtype=flat.dtype)
+    return Fit(unravel(flat), at_end, norm, state.iter_num, norm <= tol)
+
+
+def _run(solver, params, batch, tol):
+    """A jaxopt solver run on one batch, as a `Fit`."""
+    params, state = solver.run(params, batch)
+    return Fit(params, state.aux, state.error, state.iter_num, state.error <= tol)
+
+
+def _pass(solver, params, batches, tol):
+    """A stochastic solver scanned over batches, as a `Fit`."""
+    first = jax.tree.map(lambda x: x[0], batches)
+    start = (params, solver.init_state(params, first))
+    (params, state), _ = jax.lax.scan(lambda carry, data: (tuple(solver.update(*carry, data)), None), start, batches)
+    return Fit(params, state.aux, state.error, state.iter_num, state.error <= tol)
