@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zestjax.checks import check_shapes
-from zestjax.numerics import matmul, matvec
+from zestjax.numerics import matmul, matvec, safe_norm
 
 NEAREST_DEPTH = 1e-6
 
@@ -38,6 +39,12 @@ class Projected(NamedTuple):
     pixels: jax.Array
     depth: jax.Array
     in_front: jax.Array
+
+
+def transformed(transform, points):
+    """Points (..., 3) in one frame to another by (..., 4, 4) a_from_b, whose leading axes broadcast with theirs."""
+    turned = matvec(transform[..., :3, :3], points)
+    return turned + jnp.broadcast_to(transform[..., :3, 3], turned.shape)
 
 
 def rigid_inverse(transform):
@@ -72,9 +79,7 @@ def project(camera, points):
       `Projected`; the gradient is finite everywhere, behind the camera too.
     """
     check_shapes("project", points=(points, "... 3"))
-    pose = camera.camera_from_world
-    in_camera = matvec(pose[..., :3, :3], points) + pose[..., :3, 3]
-    return project_in_camera(camera.intrinsics, in_camera)
+    return project_in_camera(camera.intrinsics, transformed(camera.camera_from_world, points))
 
 
 def project_in_camera(intrinsics, points):
@@ -91,8 +96,7 @@ def unproject(camera, pixels, depth):
     check_shapes("unproject", pixels=(pixels, "... 2"))
     homogeneous = jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
     in_camera = matvec(intrinsics_inverse(camera.intrinsics), homogeneous) * depth[..., None]
-    world_from_camera = rigid_inverse(camera.camera_from_world)
-    return matvec(world_from_camera[..., :3, :3], in_camera) + world_from_camera[..., :3, 3]
+    return transformed(rigid_inverse(camera.camera_from_world), in_camera)
 
 
 def centre(camera):
@@ -105,8 +109,7 @@ def scaled(camera, factor_u, factor_v):
 
     A feature map of stride 4 has factors 1/4: feature pixel j sits on image pixel 4 j.
     """
-    factors = jnp.stack([jnp.asarray(factor_u), jnp.asarray(factor_v), jnp.asarray(1.0)])
-    return camera._replace(intrinsics=camera.intrinsics * factors.astype(camera.intrinsics.dtype)[:, None])
+    return camera._replace(intrinsics=matmul(_pixel_map(camera, factor_u, factor_v, 0, 0), camera.intrinsics))
 
 
 def resized(camera, factor_u, factor_v):
@@ -114,12 +117,146 @@ def resized(camera, factor_u, factor_v):
 
     u_new = (u + 1/2) * factor_u - 1/2.
     """
-    camera = scaled(camera, factor_u, factor_v)
-    shift = jnp.zeros((3, 3), camera.intrinsics.dtype)
-    shift = shift.at[0, 2].set((factor_u - 1) / 2).at[1, 2].set((factor_v - 1) / 2)
-    return camera._replace(intrinsics=camera.intrinsics + shift)
+    pixel_map = _pixel_map(camera, factor_u, factor_v, (factor_u - 1) / 2, (factor_v - 1) / 2)
+    return camera._replace(intrinsics=matmul(pixel_map, camera.intrinsics))
+
+
+def _pixel_map(camera, factor_u, factor_v, shift_u, shift_v):
+    """(3, 3) map of homogeneous pixels that scales, then shifts."""
+    rows = [[factor_u, 0, shift_u], [0, factor_v, shift_v], [0, 0, 1]]
+    dtype = camera.intrinsics.dtype
+    return jnp.stack([jnp.stack([jnp.asarray(entry, dtype) for entry in row]) for row in rows])
 
 
 def relative(a, b):
     """(..., 4, 4) transform a_from_b between two cameras' axes."""
     return matmul(a.camera_from_world, rigid_inverse(b.camera_from_world))
+
+
+def look_at(position, target, *, up):
+    """Pose of a camera at `position` that sees `target` in its centre, upright.
+
+    Args:
+      position, target: (..., 3) world, not the same point.
+      up: (..., 3) world direction that points up in the image; any length but 0. Where it is parallel to the viewing
+        direction another is chosen in its place.
+
+    Returns:
+      (..., 4, 4) camera_from_world.
+
+    Raises:
+      ValueError: if an argument does not end in 3.
+    """
+    check_shapes("look_at", position=(position, "... 3"), target=(target, "... 3"), up=(up, "... 3"))
+    up = jnp.broadcast_to(up, position.shape).astype(position.dtype)
+    forward = _unit(target - position)
+    sideways = jnp.cross(forward, _unit(up))
+    spare = jnp.cross(forward, jnp.roll(jnp.abs(forward) + 1e-3, 1, axis=-1))
+    parallel = safe_norm(sideways, keepdims=True) < 1e-4
+    right = _unit(jnp.where(parallel, spare, sideways))
+    down = jnp.cross(forward, right)
+    rotation = jnp.stack([right, down, forward], axis=-2)
+    return _rigid(rotation, -matvec(rotation, position))
+
+
+def camera_from_opengl_pose(pose, height, width, focal):
+    """The camera of a pose in OpenGL's axes (x right, y up, z backward), principal point in the image's middle.
+
+    Args:
+      pose: (..., 3, 4) or (..., 4, 4) world_from_camera.
+      height, width: of the image, pixels.
+      focal: pixels, a number or (focal_u, focal_v).
+
+    Returns:
+      `Camera`; the middle of an image of W pixels whose centres are integers is (W - 1) / 2.
+
+    Raises:
+      ValueError: if `pose` does not end in 3 or 4 rows of 4.
+
+    Differs from the reference: ZeST-NeRF puts the principal point at W / 2 with pixel centres at integers.
+    """
+    rows = 4 if jnp.ndim(pose) > 1 and jnp.shape(pose)[-2] == 4 else 3
+    check_shapes("camera_from_opengl_pose", pose=(pose, f"... {rows} 4"))
+    pose = jnp.asarray(pose)
+    flip = jnp.asarray([1, -1, -1], pose.dtype)
+    rotation = pose[..., :3, :3] * jnp.broadcast_to(flip, (*pose.shape[:-2], 3, 3))
+    camera_from_world = jnp.swapaxes(rotation, -1, -2)
+    focal_u, focal_v = focal if isinstance(focal, tuple | list) else (focal, focal)
+    rows = [[focal_u, 0, (width - 1) / 2], [0, focal_v, (height - 1) / 2], [0, 0, 1]]
+    batch = pose.shape[:-2]
+    entry = lambda value: jnp.broadcast_to(jnp.asarray(value, pose.dtype), batch)
+    intrinsics = jnp.stack([jnp.stack([entry(value) for value in row], -1) for row in rows], -2)
+    return Camera(intrinsics, _rigid(camera_from_world, -matvec(camera_from_world, pose[..., :3, 3])))
+
+
+def camera_from_llff_pose(pose):
+    """The camera of a LLFF pose: (..., 3, 5) columns down, right, backward, position, and (height, width, focal).
+
+    Returns:
+      `Camera`, principal point in the image's middle; see `camera_from_opengl_pose`.
+
+    Raises:
+      ValueError: if `pose` is not (..., 3, 5).
+    """
+    check_shapes("camera_from_llff_pose", pose=(pose, "... 3 5"))
+    pose = jnp.asarray(pose)
+    down, right, backward, position, size = (pose[..., k] for k in range(5))
+    opengl = jnp.stack([right, -down, backward, position], axis=-1)
+    return camera_from_opengl_pose(opengl, size[..., 0], size[..., 1], size[..., 2])
+
+
+def check_camera(where, camera):
+    """Refuse cameras that no later stage could use. For arrays with values: call it before `jax.jit`, not inside.
+
+    Args:
+      where: name of the calling function, used in the message.
+      camera: `Camera`, any leading axes.
+
+    Raises:
+      ValueError: if a shape is wrong, an entry is not finite, intrinsics are singular, not upper triangular or do not
+        end in (0, 0, 1), or a pose is not rigid (rotation of determinant 1, last row (0, 0, 0, 1)).
+    """
+    check_shapes(
+        where, intrinsics=(camera.intrinsics, "... 3 3"), camera_from_world=(camera.camera_from_world, "... 4 4")
+    )
+    k, pose = np.asarray(camera.intrinsics, np.float64), np.asarray(camera.camera_from_world, np.float64)
+    rotation = pose[..., :3, :3]
+    gram = rotation @ np.swapaxes(rotation, -1, -2)
+    lower = np.stack([k[..., 1, 0], k[..., 2, 0], k[..., 2, 1], k[..., 2, 2] - 1], -1)
+    faults = {
+        "`intrinsics` has an entry that is not finite": ~np.isfinite(k).all((-2, -1)),
+        "`camera_from_world` has an entry that is not finite": ~np.isfinite(pose).all((-2, -1)),
+        "`intrinsics` is singular: a focal length is 0": (k[..., 0, 0] == 0) | (k[..., 1, 1] == 0),
+        "`intrinsics` is not upper triangular with (0, 0, 1) in its last row": (np.abs(lower) > 1e-6).any(-1),
+        "`camera_from_world` is not rigid: its rotation is not orthonormal": (np.abs(gram - np.eye(3)) > 1e-3).any(
+            (-2, -1)
+        ),
+        "`camera_from_world` is a reflection: its determinant is -1": np.linalg.det(rotation) < 0,
+        "`camera_from_world` does not end in (0, 0, 0, 1)": (np.abs(pose[..., 3, :] - [0, 0, 0, 1]) > 1e-6).any(-1),
+    }
+    for fault, found in faults.items():
+        if np.any(found):
+            at = tuple(int(i) for i in np.argwhere(found)[0])
+            raise ValueError(f"{where}: {fault}{f' (camera {at})' if at else ''}.")
+
+
+def check_bounds(where, near, far):
+    """Refuse depth bounds other than 0 < near < far < inf. For arrays with values, not under jit.
+
+    Raises:
+      ValueError: naming the function and both bounds.
+    """
+    near, far = np.asarray(near), np.asarray(far)
+    if not (np.all(near > 0) and np.all(near < far) and np.all(np.isfinite(far))):
+        raise ValueError(f"{where}: depth bounds should be 0 < near < far, got near {near} and far {far}.")
+
+
+def _unit(vector):
+    length = safe_norm(vector, keepdims=True)
+    return vector / jnp.where(length > 0, length, 1)
+
+
+def _rigid(rotation, translation):
+    top = jnp.concatenate([rotation, translation[..., None]], axis=-1)
+    last = jnp.broadcast_to(jnp.asarray([0, 0, 0, 1], top.dtype), (*top.shape[:-2], 1, 4))
+    return jnp.concatenate([top, last], axis=-2)

@@ -1,0 +1,77 @@
+"""Which source views may be trusted at a point: not those in which something moving, or nearer, covers it.
+
+    static               (..., H, W) probability that a source's pixel shows the static scene, in [0, 1]
+    inverse_depth        (..., H, W) of what the pixel shows, in the source camera, 1 / world unit, >= 0
+    tolerance            (..., H, W) how far inverse depths may differ and still be one surface, > 0
+    point_inverse_depth  (...) of the point asked about, in the same source camera
+
+Every test is soft, so that a coarse depth costs little and a gradient flows.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from zestjax.cameras import project
+from zestjax.checks import check_shapes
+from zestjax.resample import bilinear
+
+FARTHEST = 10  # tolerances: beyond, exp(-x^2) is 0 in float32, and its square must not overflow
+
+
+class Trust(NamedTuple):
+    """Maps of each input frame, at one resolution. static: (..., H, W) in [0, 1]. inverse_depth: (..., H, W), >= 0.
+    tolerance: (..., H, W), > 0, of the inverse depth."""
+
+    static: jax.Array
+    inverse_depth: jax.Array
+    tolerance: jax.Array
+
+
+def agreement(inverse_depth, tolerance, point_inverse_depth):
+    """exp(-((inverse_depth - point) / tolerance)^2), in [0, 1]: is the point on the surface that the frame shows?"""
+    gap = jnp.clip((inverse_depth - point_inverse_depth) / tolerance, -FARTHEST, FARTHEST)
+    return jnp.exp(-gap * gap)
+
+
+def behind(inverse_depth, tolerance, point_inverse_depth):
+    """How surely the frame's surface hides the point, in [0, 1]; 0 for a point on the surface or in front of it.
+
+    1 - exp(-(relu(inverse_depth - point) / tolerance)^2).
+    """
+    gap = jnp.clip((inverse_depth - point_inverse_depth) / tolerance, 0, FARTHEST)
+    return -jnp.expm1(-gap * gap)
+
+
+def trusted(static, inverse_depth, tolerance, point_inverse_depth):
+    """Weight in [0, 1] of a source at a point: static and not hidden.
+
+    static * exp(-(relu(inverse_depth - point) / tolerance)^2); the arguments are arrays of one shape, see the header.
+    """
+    return static * (1 - behind(inverse_depth, tolerance, point_inverse_depth))
+
+
+def trusted_at(trust, camera, points):
+    """Weight of one source view at world points: `trusted`, with the maps read where the points project to.
+
+    Args:
+      trust: `Trust` of (H, W) maps.
+      camera: the source's `Camera`, at the maps' resolution.
+      points: (..., 3) world.
+
+    Returns:
+      (...) in [0, 1]; 0 outside the image and behind the camera.
+
+    Raises:
+      ValueError: on a wrong shape.
+    """
+    check_shapes(
+        "trusted_at", static=(trust.static, "H W"), tolerance=(trust.tolerance, "H W"), points=(points, "... 3")
+    )
+    pixels, depth, in_front = project(camera, points)
+    maps, visible = bilinear(jnp.stack(trust, axis=-1), pixels)
+    seen = visible & in_front
+    tolerance = jnp.where(seen, maps[..., 2], 1)
+    weight = trusted(maps[..., 0], maps[..., 1], tolerance, 1 / jnp.where(in_front, depth, 1))
+    return jnp.where(seen, weight, 0)
