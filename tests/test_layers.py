@@ -11,11 +11,11 @@ PACKAGE = Path(zestjax.__file__).parent
 LAYERS = [
     "numerics checks trees",
     "cameras video rays resample frustum",
-    "nets planesweep trust cost_volume evidence encoding",
+    "nets planesweep plane_statistics selection trust cost_volume evidence analysis encoding",
     "fields",
     "rendering depth flow presets model",
     "losses",
-    "schedules solve",
+    "adam schedules solve",
     "metrics io simulate floors testing novel_view learn training",
     "apps cli",
 ]

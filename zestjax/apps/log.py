@@ -1,0 +1,92 @@
+"""What a training run leaves to read: a JSON line per few steps, and the curves drawn from them.
+
+A line holds step, seconds (of stepping so far), seconds_per_step, and the mean of every scalar the steps reported.
+"""
+
+import contextlib
+import io
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from zestjax.io.files import write_bytes
+
+PATIENCE = 50  # steps in a row whose loss may be non-finite before the run gives up
+CLOCK = ("step", "seconds", "seconds_per_step")
+
+
+class Recorder:
+    """Means of the steps' scalars, a JSON line every `every` steps; a non-finite loss counts in no mean."""
+
+    def __init__(self, path, every):
+        self.path, self.every, self.last, self.kept, self.broken = Path(path), every, {}, [], 0
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.mark = None
+
+    def add(self, step, info, clock):
+        finite = all(math.isfinite(value) for value in info.values())
+        self.broken = 0 if finite else self.broken + 1
+        if self.broken >= PATIENCE:
+            raise FloatingPointError(
+                f"the loss was not finite in {PATIENCE} steps in a row, up to step {step}; lower the learning rate."
+            )
+        self.kept.append((step, info if finite else {}, clock.seconds))
+        if step % self.every == 0:
+            self.flush()
+
+    def flush(self):
+        if not self.kept:
+            return
+        step, _, seconds = self.kept[-1]
+        names = list(dict.fromkeys(name for _, info, _ in self.kept for name in info))
+        means = {name: float(np.mean([info[name] for _, info, _ in self.kept if name in info])) for name in names}
+        spent = seconds - (self.kept[0][2] if self.mark is None else self.mark)
+        self.last = {
+            "step": step,
+            "seconds": round(seconds, 2),
+            "seconds_per_step": round(spent / len(self.kept), 4),
+        } | means
+        self.mark, self.kept = seconds, []
+        with self.path.open("a") as file:
+            file.write(json.dumps(self.last) + "\n")
+
+
+def read_log(path):
+    """The lines of a log as dicts; a last line cut short by a crash is left out."""
+    lines = []
+    for text in Path(path).read_text().splitlines() if Path(path).exists() else []:
+        with contextlib.suppress(json.JSONDecodeError):
+            lines.append(json.loads(text))
+    return lines
+
+
+def cut_log(path, step):
+    """Forget what was logged after the checkpoint that a run resumes from."""
+    kept = [line for line in read_log(path) if line["step"] <= step]
+    write_bytes(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
+
+
+def draw_curve(log, path):
+    """The logged scalars against the step, smoothed, one small plot each, as a PNG."""
+    from matplotlib.figure import Figure
+
+    lines = read_log(log)
+    names = [n for n in dict.fromkeys(n for line in lines for n in line) if n not in CLOCK]
+    if not names:
+        return
+    columns = min(4, len(names))
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(3.6 * columns, 2.4 * rows), layout="constrained")
+    for axes, name in zip(figure.subplots(rows, columns, squeeze=False).flat, names, strict=False):
+        steps, values = np.array([(line["step"], line[name]) for line in lines if name in line]).T
+        width = max(1, len(values) // 40)
+        smooth = np.convolve(np.pad(values, (width - 1, 0), mode="edge"), np.ones(width) / width, mode="valid")
+        axes.plot(steps, values, color="0.8", linewidth=0.8)
+        axes.plot(steps, smooth, color="C0", linewidth=1.4)
+        axes.set_title(name, fontsize=9)
+        axes.tick_params(labelsize=7)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    write_bytes(path, buffer.getvalue())

@@ -1,0 +1,81 @@
+"""Training as a sequence of pure steps: which clip step n sees, and the loop that yields every state.
+
+    n        step, counted from 0 over the whole life of a run, resumed or not
+    clip     one rendered scene: frames to read and targets to predict
+
+A step's batch is a function of (seed, n) alone, so a run that is killed and resumed computes what an uninterrupted
+one does, bit for bit on one machine. Nothing here reads a clock, prints or writes: `zestjax.apps.train` does.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+
+class TrainState(NamedTuple):
+    """All that a step changes. params, opt_state: trees of arrays. step: int, steps already taken."""
+
+    params: Any
+    opt_state: Any
+    step: int
+
+
+def clip_window(step, *, window, steps_per_clip, count=None):
+    """Indices of the clips that step `step` may see: the newest few; one joins every `steps_per_clip` steps.
+
+    Args:
+      step: int >= 0.
+      window: clips alive at a time, >= 1.
+      steps_per_clip: steps between one new clip and the next, >= 1.
+      count: clips there are in all, reused from the first one when they have been through; None: without limit.
+
+    Returns:
+      range of clip indices before reuse (index modulo `count` is the clip to load).
+    """
+    newest = step // steps_per_clip
+    oldest = max(0, newest - window + 1)
+    return range(oldest, newest + 1) if count is None else range(max(oldest, newest - count + 1), newest + 1)
+
+
+def clip_index(step, *, seed, window, steps_per_clip, count=None):
+    """The clip that step `step` of run `seed` sees: drawn evenly from `clip_window` by (seed, step) alone."""
+    live = clip_window(step, window=window, steps_per_clip=steps_per_clip, count=count)
+    draw = int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0])
+    index = live[draw % len(live)]
+    return index if count is None else index % count
+
+
+def batch_key(step, *, seed):
+    """The random key of step `step`'s batch: which target, which rays, which slots are dropped."""
+    return jax.random.fold_in(jax.random.key(seed), step)
+
+
+def scalars(info):
+    """A step's report, any tree of () arrays, as {leaf path: float}; other leaves are left out."""
+    leaves = jax.tree_util.tree_leaves_with_path(info)
+    named = ((jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves)
+    return {name or "loss": float(leaf) for name, leaf in named if np.ndim(leaf) == 0}
+
+
+def training_steps(step_fn, state, batch_at, *, steps):
+    """Runs steps `state.step` to `steps` - 1 and yields (state, info) after each.
+
+    The next batch is prepared while the device computes the current step. `step_fn` may donate its arguments:
+    a yielded state is valid until the next one is asked for.
+
+    Args:
+      step_fn: (params, opt_state, batch) -> (params, opt_state, info).
+      state: `TrainState` to start from.
+      batch_at: step -> batch.
+      steps: int, where to stop.
+
+    Yields:
+      (`TrainState`, {name: float}) per step.
+    """
+    batch = batch_at(state.step) if state.step < steps else None
+    while state.step < steps:
+        params, opt_state, info = step_fn(state.params, state.opt_state, batch)
+        state = TrainState(params, opt_state, state.step + 1)
+        batch = batch_at(state.step) if state.step < steps else None
+        yield state, scalars(info)
