@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.trees import all_finite, tree_cast, tree_norm
+
 
 class AdamState(NamedTuple):
     """iter_num: () int, updates tried. skipped: () int, those left out because value or gradient was not finite.
@@ -57,14 +59,6 @@ def init_adam(params, *, value_dtype=None, aux=None):
     )
 
 
-def global_norm(tree, *, dtype=jnp.float32):
-    """L2 norm over all leaves; it neither overflows nor vanishes where the entries are finite and not 0."""
-    leaves = [jnp.asarray(x).astype(dtype) for x in jax.tree.leaves(tree)]
-    largest = jnp.max(jnp.stack([jnp.max(jnp.abs(x), initial=0) for x in leaves]))
-    unit = jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1)
-    return unit * jnp.sqrt(sum(jnp.sum((x / unit) ** 2) for x in leaves))
-
-
 def adam(params, state, grads, value, *, rate, b1=0.9, b2=0.999, eps=1e-8, clip_norm=None, skip=True, aux=None):
     """One update.
 
@@ -86,8 +80,9 @@ def adam(params, state, grads, value, *, rate, b1=0.9, b2=0.999, eps=1e-8, clip_
     Returns:
       (params, state).
     """
-    norm = global_norm(grads, dtype=state.error.dtype)
-    good = jnp.isfinite(norm) & jnp.isfinite(value) if skip else jnp.bool_(True)
+    finite = all_finite(grads)
+    norm = jnp.where(finite, tree_norm(tree_cast(grads, state.error.dtype)), jnp.inf)
+    good = finite & jnp.isfinite(value) if skip else jnp.bool_(True)
     scale = 1.0 if clip_norm is None else clip_norm / jnp.maximum(norm, clip_norm)
     count = state.iter_num - state.skipped + 1
 

@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from zestjax.adam import adam, global_norm, init_adam
+from zestjax.adam import adam, init_adam
 from zestjax.checks import check_option
+from zestjax.trees import tree_norm
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "JAXopt is no longer", DeprecationWarning)
@@ -271,7 +272,7 @@ def fit_least_squares(residual, params, *args, method="levenberg_marquardt", max
         solver = jaxopt.GaussNewton(**options)
     flat, state = solver.run(flat)
     at_end, pullback = jax.vjp(options["residual_fun"], flat)
-    norm = global_norm(pullback(at_end)[0], dtype=flat.dtype)
+    norm = tree_norm(pullback(at_end)[0])
     return Fit(unravel(flat), at_end, norm, state.iter_num, norm <= tol)
 
 
