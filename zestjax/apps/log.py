@@ -7,6 +7,7 @@ import contextlib
 import io
 import json
 import math
+import time
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ class Recorder:
     def __init__(self, path, every):
         self.path, self.every, self.last, self.kept, self.broken = Path(path), every, {}, [], 0
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.mark = None
+        self.mark, self.drawn = None, time.monotonic()
 
     def add(self, step, info, clock):
         finite = all(math.isfinite(value) for value in info.values())
@@ -51,6 +52,13 @@ class Recorder:
         self.mark, self.kept = seconds, []
         with self.path.open("a") as file:
             file.write(json.dumps(self.last) + "\n")
+
+    def draw(self, path, *, least_seconds=60.0):
+        """Draw the curves so far, unless they were less than `least_seconds` ago."""
+        now = time.monotonic()
+        if now - self.drawn >= least_seconds:
+            self.drawn = now
+            draw_curve(self.path, path)
 
 
 def read_log(path):

@@ -129,7 +129,8 @@ def _differences(arrays, wanted):
     for name, leaf in wanted:
         if name in arrays:
             spec = jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
-            have, want = arrays[name], (np.shape(spec), np.result_type(spec))
+            dtype = spec.dtype if hasattr(spec, "dtype") else jnp.asarray(spec).dtype
+            have, want = arrays[name], (np.shape(spec), dtype)
             if (have.shape, have.dtype) != want:
                 found.append(f"`{name}` is {have.dtype} {have.shape}, expected {want[1]} {want[0]}")
     return found

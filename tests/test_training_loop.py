@@ -1,0 +1,226 @@
+"""The loop around the steps: logs, checkpoints, and the same numbers after any kind of interruption."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from zestjax.apps import clips
+from zestjax.apps.log import read_log
+from zestjax.apps.loop import LoopOptions, run_loop
+from zestjax.io.checkpoints import latest_checkpoint
+from zestjax.io.weights import WeightsError, load_weights
+from zestjax.training import TrainState, batch_key
+
+RUN = {"config": {"width": 3}, "seed": 7, "data": "toy"}
+
+
+def toy_step(params, opt_state, batch):
+    """Gradient descent with momentum on |params - batch|^2."""
+    grads = jax.tree.map(lambda p: p - batch, params)
+    opt_state = jax.tree.map(lambda m, g: 0.9 * m + g, opt_state, grads)
+    return jax.tree.map(lambda p, m: p - 0.1 * m, params, opt_state), opt_state, {"loss": jnp.sum(grads["w"] ** 2)}
+
+
+def toy_state():
+    return TrainState({"w": jnp.zeros(3, jnp.float32)}, {"w": jnp.zeros(3, jnp.float32)}, 0)
+
+
+def toy_batch(step):
+    return jax.random.normal(batch_key(step, seed=7), (3,))
+
+
+def options(out, steps, **changes):
+    return LoopOptions(out, steps, quiet=True, log_steps=2, checkpoint_seconds=0.0, **changes)
+
+
+@pytest.fixture
+def whole(tmp_path):
+    """Ten uninterrupted steps."""
+    return run_loop(toy_step, toy_state(), toy_batch, options(tmp_path / "whole", 10), metadata=RUN)
+
+
+def test_a_run_leaves_weights_log_curve_and_checkpoints(tmp_path, whole):
+    out = tmp_path / "whole"
+    assert {path.name for path in out.iterdir()} == {"weights.safetensors", "log.jsonl", "curve.png", "checkpoints"}
+    weights, metadata = load_weights(out / "weights.safetensors", toy_state().params)
+    np.testing.assert_array_equal(weights["w"], whole.state.params["w"])
+    assert metadata["seed"] == 7 and metadata["step"] == 10
+    assert [line["step"] for line in read_log(out / "log.jsonl")] == list(range(1, 11))
+    assert len(list((out / "checkpoints").iterdir())) == 2
+
+
+def test_a_run_broken_off_by_an_error_resumes_to_the_same_bits(tmp_path, whole):
+    def breaking(step):
+        if step == 6:
+            raise RuntimeError("power cut")
+        return toy_batch(step)
+
+    out = tmp_path / "broken"
+    with pytest.raises(RuntimeError, match="power cut"):
+        run_loop(toy_step, toy_state(), breaking, options(out, 10), metadata=RUN)
+    resumed = run_loop(toy_step, toy_state(), toy_batch, options(out, 10, resume=True), metadata=RUN)
+    for name in ("params", "opt_state"):
+        np.testing.assert_array_equal(getattr(resumed.state, name)["w"], getattr(whole.state, name)["w"])
+    assert [line["step"] for line in read_log(out / "log.jsonl")] == list(range(1, 11))
+
+
+SCRIPT = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from test_training_loop import *
+slow = lambda step: (time.sleep(0.05), toy_batch(step))[1]
+resume = sys.argv[2] == "resume"
+run_loop(toy_step, toy_state(), slow, options(sys.argv[1], 40, resume=resume), metadata=RUN)
+"""
+
+
+def test_a_killed_process_resumes_to_the_same_bits(tmp_path):
+    out = tmp_path / "killed"
+    command = [sys.executable, "-c", SCRIPT.format(tests=os.path.dirname(__file__)), str(out)]
+    process = subprocess.Popen([*command, "fresh"], stderr=subprocess.DEVNULL)
+    while latest_checkpoint(out / "checkpoints", (toy_state().params, toy_state().opt_state)) is None:
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    resumed = run_loop(toy_step, toy_state(), toy_batch, options(out, 40, resume=True), metadata=RUN)
+    plain = run_loop(toy_step, toy_state(), toy_batch, options(tmp_path / "plain", 40), metadata=RUN)
+    np.testing.assert_array_equal(resumed.state.params["w"], plain.state.params["w"])
+
+
+def test_ctrl_c_ends_the_run_after_its_step_with_a_checkpoint(tmp_path):
+    def interrupting(step):
+        if step == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return toy_batch(step)
+
+    result = run_loop(toy_step, toy_state(), interrupting, options(tmp_path, 100), metadata=RUN)
+    assert not result.finished and result.state.step < 10
+    found = latest_checkpoint(tmp_path / "checkpoints", (toy_state().params, toy_state().opt_state))
+    assert found is not None and found.step == result.state.step
+
+
+def test_a_time_limit_counts_stepping_after_the_compile(tmp_path):
+    def slow(step):
+        time.sleep(1.0 if step == 0 else 0.05)
+        return toy_batch(step)
+
+    result = run_loop(toy_step, toy_state(), slow, options(tmp_path, 1000, seconds=0.3), metadata=RUN)
+    assert result.finished and 0.3 <= result.seconds < 1.0 < result.compile_seconds
+
+
+def test_a_damaged_newest_checkpoint_falls_back_to_the_one_before(tmp_path, capsys, whole):
+    newest = sorted((tmp_path / "whole" / "checkpoints").iterdir())[-1]
+    newest.write_bytes(newest.read_bytes()[:-7])
+    resumed = run_loop(toy_step, toy_state(), toy_batch, options(tmp_path / "whole", 10, resume=True), metadata=RUN)
+    np.testing.assert_array_equal(resumed.state.params["w"], whole.state.params["w"])
+    assert "step 9" in capsys.readouterr().err
+
+
+def test_a_folder_of_another_run_is_refused_and_kept(tmp_path, whole):
+    out = tmp_path / "whole"
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(WeightsError, match="another seed"):
+        run_loop(toy_step, toy_state(), toy_batch, options(out, 20, resume=True), metadata=RUN | {"seed": 8})
+    with pytest.raises(WeightsError, match="--resume"):
+        run_loop(toy_step, toy_state(), toy_batch, options(out, 20), metadata=RUN)
+    wide = TrainState({"w": jnp.zeros(4)}, {"w": jnp.zeros(4)}, 0)
+    with pytest.raises(WeightsError, match="another model or preset"):
+        run_loop(toy_step, wide, toy_batch, options(out, 20, resume=True), metadata=RUN)
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def test_a_full_disk_costs_no_earlier_checkpoint(tmp_path, monkeypatch, whole):
+    def full(content, *arguments, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("zestjax.io.weights.write_bytes", full)
+    with pytest.raises(WeightsError, match="No space left"):
+        run_loop(toy_step, toy_state(), toy_batch, options(tmp_path / "whole", 20, resume=True), metadata=RUN)
+    monkeypatch.undo()
+    found = latest_checkpoint(tmp_path / "whole" / "checkpoints", (toy_state().params, toy_state().opt_state))
+    assert found is not None and found.step == 10
+
+
+def test_a_loss_that_stays_non_finite_ends_the_run(tmp_path):
+    def broken(params, opt_state, batch):
+        return params, opt_state, {"loss": jnp.float32(jnp.nan)}
+
+    with pytest.raises(FloatingPointError, match="not finite"):
+        run_loop(broken, toy_state(), toy_batch, options(tmp_path, 1000), metadata=RUN)
+
+
+def test_the_log_holds_means_and_skips_non_finite_steps(tmp_path):
+    def step(params, opt_state, batch):
+        return params, opt_state, {"loss": batch}
+
+    losses = [1.0, float("nan"), 3.0, 5.0]
+    state = TrainState({"w": jnp.zeros(1)}, {}, 0)
+    run_loop(
+        step, state, lambda n: jnp.float32(losses[n]), LoopOptions(tmp_path, 4, log_steps=4, quiet=True), metadata=RUN
+    )
+    (line,) = [json.loads(text) for text in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert line["step"] == 4 and line["loss"] == 3.0
+
+
+PRODUCER = """
+import sys
+from typing import NamedTuple
+import numpy as np
+from zestjax.apps import clips
+
+class Toy(NamedTuple):
+    images: np.ndarray
+    extra: np.ndarray | None = None
+
+def render(spec, index):
+    if index == 13:
+        raise ValueError("clip 13 is unlucky")
+    return Toy(np.full((2, spec.height, spec.width, 3), index, np.uint8))
+
+clips.render_clip = render
+sys.exit(clips.main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+def source(tmp_path, monkeypatch):
+    """Clips from a real producer process whose renderer is a toy."""
+    popen = subprocess.Popen
+    run = lambda command, **kw: popen([sys.executable, "-c", PRODUCER, *command[3:]], **kw)
+    monkeypatch.setattr(clips.subprocess, "Popen", run)
+    with clips.ClipSource(clips.ClipSpec(0, 4, 6), tmp_path, alive=3, evict=True) as source:
+        yield source
+
+
+def test_clips_are_rendered_ahead_by_a_process_of_their_own(source, tmp_path):
+    assert (source.clip(0, range(0, 3))["images"] == 0).all()
+    deadline = time.time() + 20
+    while not clips.clip_path(tmp_path, 2).exists() and time.time() < deadline:
+        time.sleep(0.02)
+    assert (source.clip(2, range(2, 4))["images"] == 2).all()
+    assert not clips.clip_path(tmp_path, 0).exists(), "a clip that left the window is removed"
+
+
+def test_a_damaged_clip_is_rendered_again(source, tmp_path):
+    clips.clip_path(tmp_path, 5).write_bytes(b"not a clip")
+    assert (source.clip(5, [5])["images"] == 5).all()
+
+
+def test_a_producer_that_fails_says_why(source):
+    with pytest.raises(RuntimeError, match="clip 13 is unlucky"):
+        source.clip(13, [13])
+
+
+def test_the_producer_ends_with_its_trainer(source):
+    process = source.producer.process
+    process.stdin.close()
+    assert process.wait(timeout=20) == 0

@@ -1,0 +1,182 @@
+"""The loop around pure training steps: clock, progress, log, curve, checkpoints, signals.
+
+A folder holds `log.jsonl` (a line per few steps: mean of every scalar the step reports), `curve.png`, `checkpoints/`
+and `weights.safetensors`. A checkpoint is a whole `TrainState`; the log is cut back to it when a run resumes.
+"""
+
+import contextlib
+import dataclasses
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from tqdm import tqdm
+
+from zestjax.apps.log import Recorder, cut_log
+from zestjax.io.checkpoints import latest_checkpoint, save_checkpoint
+from zestjax.io.weights import WeightsError, save_weights
+from zestjax.training import TrainState, training_steps
+
+
+@dataclasses.dataclass(frozen=True)
+class LoopOptions:
+    """When a loop stops and how often it writes.
+
+    out: folder. steps: int, total. seconds: of stepping, the first step (which compiles) left out; None: no limit.
+    resume: continue from the folder's newest checkpoint. checkpoint_seconds, log_steps: intervals. quiet: no progress.
+    """
+
+    out: Path
+    steps: int
+    seconds: float | None = None
+    resume: bool = False
+    checkpoint_seconds: float = 300.0
+    log_steps: int = 10
+    quiet: bool = False
+
+
+class LoopResult(NamedTuple):
+    """state: the last `TrainState`. seconds: spent stepping, over all resumed parts. compile_seconds: of this call's
+    first step. report: the last logged means. finished: whether the steps or the time were used up, not a signal."""
+
+    state: TrainState
+    seconds: float
+    compile_seconds: float
+    report: dict
+    finished: bool
+
+
+def run_loop(step_fn, start, batch_at, options, *, metadata):
+    """Train until the steps, the seconds or a signal ends it; every file is complete whenever the process dies.
+
+    Args:
+      step_fn: (params, opt_state, batch) -> (params, opt_state, info), may donate.
+      start: fresh `TrainState`; also the template that a checkpoint is read into.
+      batch_at: step -> batch, a pure function of the step.
+      options: `LoopOptions`.
+      metadata: dict stored with every checkpoint and the weights: the full configuration and the run's seed.
+
+    Returns:
+      `LoopResult`.
+
+    Raises:
+      WeightsError: the folder holds another run, or a checkpoint cannot be read or written.
+      FloatingPointError: the loss stays non-finite.
+    """
+    out = Path(options.out)
+    start, seconds = _restore(start, out, metadata) if options.resume else _start(start, out)
+    if start.step >= options.steps:
+        return LoopResult(start, seconds, 0.0, {}, True)
+    recorder = Recorder(out / "log.jsonl", options.log_steps)
+    save = lambda state, seconds: _save(out, state, metadata, seconds)
+    with _StopOnSignal() as stop, _bar(start.step, options) as bar:
+        clock = _Clock(seconds, options)
+        for state, info in training_steps(step_fn, start, batch_at, steps=options.steps):
+            clock.tick()
+            recorder.add(state.step, info, clock)
+            _show(bar, recorder, clock)
+            done = stop.asked or clock.over() or state.step == options.steps
+            if done or clock.checkpoint_due():
+                recorder.flush()
+                save(state, clock.seconds)
+                recorder.draw(out / "curve.png")
+            if done:
+                break
+    recorder.draw(out / "curve.png", least_seconds=0)
+    return LoopResult(state, clock.seconds, clock.compile_seconds, recorder.last, not stop.asked)
+
+
+def _start(state, out):
+    if any((out / "checkpoints").glob("step_*.safetensors")):
+        raise WeightsError(
+            f"{out}: holds the checkpoints of an earlier run; continue it with --resume or choose another --out."
+        )
+    (out / "log.jsonl").unlink(missing_ok=True)
+    return state, 0.0
+
+
+def _restore(state, out, metadata):
+    """The newest readable checkpoint of this same run, or the fresh state when there is none yet."""
+    found = latest_checkpoint(out / "checkpoints", (state.params, state.opt_state))
+    if found is None:
+        return state, 0.0
+    for warning in found.warnings:
+        tqdm.write(f"warning: {warning} Going on from step {found.step}.", file=sys.stderr)
+    differing = [name for name in ("config", "seed", "data") if found.metadata["run"].get(name) != metadata.get(name)]
+    if differing:
+        raise WeightsError(
+            f"{out}: its checkpoints are of a run with another {' and '.join(differing)}; resume it with the same "
+            "command, or choose another --out."
+        )
+    cut_log(out / "log.jsonl", found.step)
+    return TrainState(*found.tree, found.step), found.metadata["seconds"]
+
+
+def _save(out, state, metadata, seconds):
+    tree = (state.params, state.opt_state)
+    save_checkpoint(out / "checkpoints", state.step, tree, {"run": metadata, "seconds": seconds})
+    save_weights(
+        out / "weights.safetensors",
+        state.params,
+        metadata=metadata | {"step": state.step, "seconds": round(seconds, 1)},
+    )
+
+
+class _Clock:
+    """Seconds of stepping so far, without the first step of this process, which compiles."""
+
+    def __init__(self, seconds, options):
+        self.seconds, self.options, self.compile_seconds = seconds, options, 0.0
+        self.start = self.last = self.saved = time.perf_counter()
+
+    def tick(self):
+        now = time.perf_counter()
+        if self.compile_seconds:
+            self.seconds += now - self.last
+        else:
+            self.compile_seconds = now - self.last
+        self.last = now
+
+    def over(self):
+        return self.options.seconds is not None and self.seconds >= self.options.seconds
+
+    def checkpoint_due(self):
+        due = self.last - self.saved >= self.options.checkpoint_seconds
+        self.saved = self.last if due else self.saved
+        return due
+
+
+class _StopOnSignal:
+    """Turns the first Ctrl-C or SIGTERM into a wish that the loop grants after its step; the second ends it at once."""
+
+    def __enter__(self):
+        self.asked, self.before = False, {}
+        with contextlib.suppress(ValueError):  # not the main thread: no signals to catch
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self.before[number] = signal.signal(number, self._ask)
+        return self
+
+    def _ask(self, number, frame):
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+
+    def __exit__(self, *_):
+        for number, handler in self.before.items():
+            signal.signal(number, handler)
+
+
+def _bar(step, options):
+    return tqdm(total=options.steps, initial=step, disable=options.quiet, unit="step", file=sys.stderr, mininterval=1.0)
+
+
+def _show(bar, recorder, clock):
+    if clock.options.seconds is not None:
+        left = max(0.0, clock.options.seconds - clock.seconds)
+        bar.set_description(f"at most {left / 60:.0f} min left", refresh=False)
+    loss = recorder.last.get("loss")
+    if loss is not None:
+        bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
+    bar.update(1)

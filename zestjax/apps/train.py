@@ -1,0 +1,141 @@
+"""`zestjax train`: one set of weights from many scenes, simulated as they are needed or read from folders."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+
+import zestjax
+from zestjax import learn
+from zestjax.apps.clips import ClipSource, ClipSpec, clip_folder
+from zestjax.apps.loop import LoopOptions, run_loop
+from zestjax.io.weights import load_weights
+from zestjax.presets import preset as preset_of
+from zestjax.training import TrainState, batch_key, clip_index, clip_window
+
+AHEAD = 8  # clips that the producer keeps rendered beyond the newest one in use
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainOptions:
+    """The flags of `zestjax train`.
+
+    out, preset, steps, minutes, resume, seed, quiet: as the command's. scenes: folders to train on; empty: simulated.
+    weights: start from these. clips: folder of rendered clips, kept; None: the cache, where used ones are removed.
+    clip_count: reuse that many clips; None: new ones for ever. window: clips alive at a time.
+    steps_per_clip: steps between one new clip and the next. checkpoint_minutes: between two checkpoints.
+    changes: fields of the preset replaced.
+    """
+
+    out: Path
+    preset: str = "small"
+    scenes: tuple = ()
+    steps: int = 20_000
+    minutes: float | None = None
+    resume: bool = False
+    seed: int = 0
+    weights: Path | None = None
+    clips: Path | None = None
+    clip_count: int | None = None
+    window: int = 16
+    steps_per_clip: int = 4
+    checkpoint_minutes: float = 5.0
+    quiet: bool = False
+    changes: tuple = ()
+
+
+class Summary(NamedTuple):
+    """line: what the command prints. weights: file. result: `LoopResult`."""
+
+    line: str
+    weights: Path
+    result: object
+
+
+def train(options):
+    """Run `zestjax train`.
+
+    Returns:
+      `Summary`.
+
+    Raises:
+      ValueError, WeightsError: bad options; the folder holds another run; a damaged checkpoint.
+    """
+    config = preset_of(options.preset, **dict(options.changes))
+    state, step_fn = fresh(config, options)
+    metadata = run_metadata(config, options)
+    limit = None if options.minutes is None else 60 * options.minutes
+    loop = LoopOptions(
+        options.out, options.steps, limit, options.resume, 60 * options.checkpoint_minutes, quiet=options.quiet
+    )
+    with batches(config, options) as batch_at:
+        result = run_loop(step_fn, state, batch_at, loop, metadata=metadata)
+    return summarise(result, options.out, "train")
+
+
+def fresh(config, options):
+    """A run's first `TrainState`, from the seed or from given weights, and its compiled step."""
+    params = learn.init_params(jax.random.key(options.seed), config)
+    if options.weights is not None:
+        params, _ = load_weights(options.weights, params)
+    init, step_fn = learn.make_train_step(config, steps=options.steps)
+    return TrainState(params, init(params), 0), step_fn
+
+
+def run_metadata(config, options):
+    """Everything that makes one run's numbers differ from another's, as JSON can hold it."""
+    data = {"scenes": [str(path) for path in options.scenes], "clip_count": options.clip_count}
+    data |= {"window": options.window, "steps_per_clip": options.steps_per_clip}
+    config = {name: list(v) if isinstance(v, tuple) else v for name, v in dataclasses.asdict(config).items()}
+    return {
+        "preset": options.preset, "config": config, "seed": options.seed, "steps": options.steps, "data": data,
+        "start": None if options.weights is None else str(options.weights), "zestjax": zestjax.__version__,
+        "jax": jax.__version__, "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
+    }  # fmt: skip
+
+
+def summarise(result, out, verb):
+    """The one line on stdout."""
+    state = result.state
+    rate = result.report.get("seconds_per_step", float("nan"))
+    ended = "" if result.finished else f" (interrupted; go on with: zestjax {verb} --resume --out {out})"
+    loss = result.report.get("loss")
+    said = "" if loss is None else f", loss {loss:.4f}"
+    line = (
+        f"{verb}: {state.step} steps in {result.seconds:.0f} s ({rate:.2f} s a step, "
+        f"compile {result.compile_seconds:.0f} s){said}: {Path(out) / 'weights.safetensors'}{ended}"
+    )
+    return Summary(line, Path(out) / "weights.safetensors", result)
+
+
+def batches(config, options):
+    """Context: step -> batch, from simulated clips or, given `options.scenes`, from their frames."""
+    return _SimulatedBatches(config, options)
+
+
+class _SimulatedBatches:
+    """Batches of the sliding window of simulated clips; a context that ends their producer."""
+
+    def __init__(self, config, options):
+        spec = ClipSpec(options.seed, config.height, config.width)
+        folder = clip_folder(spec, root=options.clips)
+        self.config, self.seed, self.count = config, options.seed, options.clip_count
+        self.window = {"window": options.window, "steps_per_clip": options.steps_per_clip, "count": self.count}
+        self.ahead = AHEAD * options.steps_per_clip
+        evict = options.clips is None and self.count is None
+        self.source = ClipSource(spec, folder, alive=options.window + 1, evict=evict)
+
+    def __enter__(self):
+        return self.batch
+
+    def __exit__(self, *_):
+        self.source.__exit__()
+
+    def batch(self, step):
+        live, soon = clip_window(step, **self.window), clip_window(step + self.ahead, **self.window)
+        wanted = range(live.start, soon.stop)
+        wrapped = [index if self.count is None else index % self.count for index in wanted]
+        arrays = self.source.clip(clip_index(step, seed=self.seed, **self.window), wrapped)
+        return learn.batch_from_clip(batch_key(step, seed=self.seed), learn.clip_from_arrays(arrays), self.config)
