@@ -1,0 +1,264 @@
+"""A scene ready for use: the input video, and the pictures it is judged by.
+
+    N        frames of the input video
+    H W      rows and columns asked for; everything is brought to them, cameras and flow vectors with it
+    target   a camera and a time to predict, with the truth where there is one
+
+A protocol says what the targets are:
+
+    held-out   pictures of other cameras than the one that took the frame of their time; all frames are inputs
+    strict     frames of the video itself, each never among its own inputs
+    paper      frames of the video itself, which are among the inputs: this leaks the answer, and is kept only to set
+               figures beside the paper's
+"""
+
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from zestjax.cameras import Camera, resized
+from zestjax.checks import check_option
+from zestjax.io.inputs import check_inputs
+from zestjax.io.layouts import select
+from zestjax.io.nrnerf import is_nrnerf, read_nrnerf
+from zestjax.io.nsff import is_nsff, read_nsff
+from zestjax.io.pictures import image_size, read_image, read_mask, resize_area, resize_nearest
+from zestjax.video import Video
+
+PROTOCOLS = ("held-out", "strict", "paper")
+
+LAYOUTS = {"nsff": (is_nsff, read_nsff), "nrnerf": (is_nrnerf, read_nrnerf)}
+"""By name: a function of the folder that recognises it, and one that reads it to a `zestjax.io.layouts.Record`."""
+
+
+class Flow(NamedTuple):
+    """Optical flow of every frame. vectors: (N, H, W, 2) pixels, 0 where not valid. valid: (N, H, W) bool."""
+
+    vectors: np.ndarray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True)
+class Target:
+    """A picture to predict.
+
+    time: frame index. camera_name: str. camera: `Camera` of numpy arrays. image: (H, W, 3) float32, or None where the
+    truth is not known. dynamic: (H, W) bool, moving pixels. exclude: input frames that may not be used for it.
+    depth: (H, W) world units. flow: (H, W, 2) pixels towards the next time, NaN where not known.
+    """
+
+    time: int
+    camera_name: str
+    camera: Camera
+    image: np.ndarray | None = None
+    dynamic: np.ndarray | None = None
+    exclude: tuple[int, ...] = ()
+    depth: np.ndarray | None = None
+    flow: np.ndarray | None = None
+
+
+class Targets(Sequence):
+    """Targets that are read when they are asked for, and not kept."""
+
+    def __init__(self, readers: Sequence[Callable[[], Target]]):
+        self._readers = tuple(readers)
+
+    def __len__(self):
+        return len(self._readers)
+
+    def __getitem__(self, index):
+        return Targets(self._readers[index]) if isinstance(index, slice) else self._readers[index]()
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene in memory, as numpy arrays.
+
+    name, layout: str. video: `Video`. targets: sequence of `Target`, which may read them as it goes. motion_masks:
+    (N, H, W) bool. flow_forward, flow_backward: `Flow`. disparity: (N, H, W), up to scale and shift. What a scene
+    lacks is None.
+    """
+
+    name: str
+    video: Video
+    targets: Sequence[Target]
+    motion_masks: np.ndarray | None = None
+    flow_forward: Flow | None = None
+    flow_backward: Flow | None = None
+    disparity: np.ndarray | None = None
+    layout: str = ""
+
+
+def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out", targets=None):
+    """Read a scene from a folder.
+
+    Args:
+      path: a folder in one of the layouts of `LAYOUTS`.
+      height: rows wanted; None follows from the width by the pictures' shape, or is theirs.
+      width: columns wanted; the same.
+      layout: its name; recognised unless told.
+      protocol: `held-out`, `strict` or `paper`; see above.
+      targets: which times to predict, as frame indices; `(time, camera name)` pairs choose single pictures; None for
+        all.
+
+    Returns:
+      `Scene`.
+
+    Raises:
+      ValueError: no such folder, unknown layout, a file that is not what it should be, a protocol that the scene has no
+        targets for, targets that do not exist, or a video that `check_inputs` refuses.
+    """
+    path = Path(path)
+    check_option("load_scene", protocol=(protocol, PROTOCOLS))
+    record = LAYOUTS[_layout_of(path, layout)][1](path)
+    if protocol == "held-out" and not record.held_out:
+        raise ValueError(f"{path}: has no pictures of other cameras (mv_images), so no held-out target; use `strict`.")
+    size = _size(image_size(record.images[0]), height, width)
+    images = np.stack([resize_area(read_image(file), *size) for file in record.images])
+    cameras = _resized(record.cameras, record.size, size)
+    video = Video(images, cameras, np.float32(record.near), np.float32(record.far))
+    check_inputs(str(path), video)
+    masks = _stack(record.motion_masks, len(images), lambda file: resize_nearest(read_mask(file), *size))
+    listed = _other_views(record, size) if protocol == "held-out" else _own_views(record, video, masks, protocol)
+    return Scene(
+        name=record.name,
+        video=video,
+        targets=Targets(_chosen(path, listed, targets)),
+        motion_masks=masks,
+        flow_forward=_flow(record.flow_forward, len(images), size),
+        flow_backward=_flow(record.flow_backward, len(images), size),
+        disparity=_stack(record.disparity, len(images), lambda file: resize_nearest(_arrays(file), *size)),
+        layout=record.layout,
+    )
+
+
+def _layout_of(path, layout):
+    if not path.is_dir():
+        raise ValueError(f"{path}: is not a folder; give one in a supported layout ({', '.join(LAYOUTS)}).")
+    if layout is not None:
+        check_option("load_scene", layout=(layout, tuple(LAYOUTS)))
+        return layout
+    found = [name for name, (recognises, _) in LAYOUTS.items() if recognises(path)]
+    if not found:
+        raise ValueError(
+            f"{path}: is in none of the supported layouts ({', '.join(LAYOUTS)}); see `zestjax.io` on each."
+        )
+    return found[0]
+
+
+def _size(have, height, width):
+    """(height, width), each from the other and the stored size (height, width) where not given."""
+    if height is None:
+        height = have[0] if width is None else round(width * have[0] / have[1])
+    width = round(height * have[1] / have[0]) if width is None else width
+    if min(height, width) < 1:
+        raise ValueError(f"load_scene: the size is {height} x {width}, expected at least 1 x 1.")
+    return int(height), int(width)
+
+
+def _resized(cameras, have, size):
+    """The cameras of pictures of `size`, from those of pictures of size `have`, both (height, width)."""
+    cameras = Camera(*(np.asarray(leaf, np.float32) for leaf in cameras))
+    return Camera(*(np.asarray(leaf) for leaf in resized(cameras, size[1] / have[1], size[0] / have[0])))
+
+
+def _own_views(record, video, masks, protocol):
+    """[((time, camera name), reader)] of the video's own frames."""
+
+    def read(time):
+        return Target(
+            time=time,
+            camera_name="input",
+            camera=select(video.cameras, time),
+            image=video.images[time],
+            dynamic=None if masks is None else masks[time],
+            exclude=(time,) if protocol == "strict" else (),
+            **_truth(record.truth.get(time), video.images.shape[1:3]),
+        )
+
+    return [((time, "input"), lambda time=time: read(time)) for time in range(len(video.images))]
+
+
+def _other_views(record, size):
+    """[((time, camera name), reader)] of the pictures of other cameras."""
+
+    def read(entry):
+        return Target(
+            time=entry.time,
+            camera_name=entry.camera_name,
+            camera=_resized(entry.camera, record.size, size),
+            image=resize_area(read_image(entry.image), *size),
+            dynamic=None if entry.mask is None else resize_nearest(read_mask(entry.mask), *size),
+            **_truth(entry.truth, size),
+        )
+
+    return [((entry.time, entry.camera_name), lambda entry=entry: read(entry)) for entry in record.held_out]
+
+
+def _chosen(path, listed, targets):
+    """The readers of the targets asked for, in the order asked."""
+    if targets is None:
+        return [reader for _, reader in listed]
+    chosen = []
+    for wanted in targets:
+        match = lambda name, wanted=wanted: name == tuple(wanted) if isinstance(wanted, tuple) else name[0] == wanted
+        readers = [reader for name, reader in listed if match(name)]
+        if not readers:
+            times = sorted({time for (time, _), _ in listed})
+            raise ValueError(f"{path}: no target {wanted}; this protocol has times {times[0]} to {times[-1]}.")
+        chosen += readers
+    return chosen
+
+
+def _truth(path, size):
+    """`depth` and `flow` of a truth file at a size, those that it has."""
+    if path is None:
+        return {}
+    arrays = _arrays(path)
+    known = {key: resize_nearest(arrays[key], *size) for key in ("depth", "flow") if key in arrays}
+    if "flow" in known:
+        known["flow"] = known["flow"] * _flow_scale(arrays["flow"].shape, size)
+    return known
+
+
+def _flow(files, count, size):
+    """`Flow` of the frames, not valid where a frame has no file; None when none has."""
+    if not files:
+        return None
+    vectors, valid = np.zeros((count, *size, 2), np.float32), np.zeros((count, *size), bool)
+    for i in range(count):
+        if i in files:
+            arrays = _arrays(files[i])
+            if not {"flow", "mask"} <= arrays.keys():
+                raise ValueError(f"{files[i]}: should hold `flow` and `mask`, got {sorted(arrays)}; compute it again.")
+            valid[i] = resize_nearest(arrays["mask"], *size) > 0
+            flow = resize_nearest(arrays["flow"], *size) * _flow_scale(arrays["flow"].shape, size)
+            valid[i] &= np.isfinite(flow).all(-1)
+            vectors[i] = np.where(valid[i][..., None], flow, 0)
+    return Flow(vectors, valid)
+
+
+def _flow_scale(have, size):
+    return np.array([size[1] / have[1], size[0] / have[0]], np.float32)
+
+
+def _stack(files, count, read):
+    """One array for all frames; None unless every frame has a file."""
+    return np.stack([read(files[i]) for i in range(count)]) if all(i in files for i in range(count)) else None
+
+
+def _arrays(path):
+    """The arrays of an npz, or the one array of an npy file.
+
+    Raises:
+      ValueError: the file is missing or damaged.
+    """
+    try:
+        content = np.load(path, allow_pickle=False)
+        return content if isinstance(content, np.ndarray) else dict(content)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: is not a numpy file that can be read ({error}); copy or write it again.") from error
