@@ -1,0 +1,166 @@
+"""Encoding volumes: source frames swept over the planes of one camera, compared, and encoded by a 3-D U-Net.
+
+    V        source frames: the K key-frames of the geometry volume, or the slots of the motion volume
+    D h w    planes (the nearest first), rows and columns of a volume
+    C        learned feature channels; a table holds C features, 3 colours, and of trusted frames 3 maps:
+             probability of moving, inverse depth of the visible surface, tolerance of it
+    votes    what the frames' own depths say about a cell: is it their surface, or do they look through it
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from zestjax.cameras import Camera
+from zestjax.checks import check_shapes
+from zestjax.cost_volume import cost_volume
+from zestjax.nets.cost_regulariser import CostRegulariser, cost_regulariser, init_cost_regulariser
+from zestjax.nets.feature_pyramid import FeaturePyramid, init_feature_pyramid
+from zestjax.nets.layers import Dense, dense, init_dense
+from zestjax.planesweep import carry, homographies, sweep_grid
+from zestjax.trust import Trust, agreement
+
+TRUST_MAPS = 3
+VOTE_GAIN = 4.0
+
+
+class VolumeParams(NamedTuple):
+    """pyramid: 2-D feature net, None where features come from the frames' analysis. regulariser: 3-D U-Net.
+    occupied: Dense from the encoded channels to a logit per cell, None without guided sampling."""
+
+    pyramid: FeaturePyramid | None
+    regulariser: CostRegulariser
+    occupied: Dense | None
+
+
+class SweepViews(NamedTuple):
+    """tables: (V, h, w, C + 3), or C + 6 of trusted frames. cameras: `Camera` (V, ...) at the tables' resolution.
+    valid: (V,) 1, or 0 for a slot the video does not fill."""
+
+    tables: jax.Array
+    cameras: Camera
+    valid: jax.Array
+
+
+class Volume(NamedTuple):
+    """cells: (D, h, w, channels) encoded. logits: (D, h, w), a surface is here; None without guided sampling."""
+
+    cells: jax.Array
+    logits: jax.Array | None
+
+
+class Votes(NamedTuple):
+    """Per cell and frame, each (D, h, w, V), 0 where the frame does not see the cell.
+
+    seen: 1 where it does. moving: probability that its pixel moves. surface: that the cell is its visible surface.
+    through: how clearly it looks through the cell, in [0, 1].
+    """
+
+    seen: jax.Array
+    moving: jax.Array
+    surface: jax.Array
+    through: jax.Array
+
+
+def init_volume(key, *, features, views, widths, colours, trusted, slots, pyramid_widths, occupied):
+    """Parameters of one encoding volume.
+
+    Args:
+      key: random key.
+      features: C.
+      views: V, which decides the channels where every view's colours are kept.
+      widths: of the 3-D U-Net.
+      colours: `all` keeps every view's warped colours (the paper's 32 + 3 V channels), `mean` their mean.
+      trusted: whether tables carry trust maps.
+      slots: whether votes are kept slot by slot (motion) or averaged over frames (geometry).
+      pyramid_widths: of the feature net, or None without one.
+      occupied: whether cells get a surface logit.
+    """
+    a, b, c = jax.random.split(key, 3)
+    channels = features + 3 * views if colours == "all" else features + 7
+    channels += (3 * views if slots else 4) * trusted
+    pyramid = None if pyramid_widths is None else init_feature_pyramid(a, widths=pyramid_widths)
+    regulariser = init_cost_regulariser(b, channels, widths=widths)
+    return VolumeParams(pyramid, regulariser, init_dense(c, widths[0], 1, scale=0.1) if occupied else None)
+
+
+def cell_votes(samples, hom, grid, depths):
+    """`Votes` from the trust maps that each view shows at each cell.
+
+    Args:
+      samples: (D, h, w, V, 3) moving, inverse depth and tolerance; 0 where a view does not see.
+      hom: (D, V, 3, 3). grid: (h, w, 3). depths: (D,).
+    """
+    moving, surface, tolerance = samples[..., 0], samples[..., 1], samples[..., 2]
+    seen = tolerance > 0
+    share = jnp.moveaxis(carry(hom, grid)[2], 1, -1)
+    point = 1 / jnp.where(seen, share * depths[:, None, None, None], 1)
+    safe = jnp.where(seen, tolerance, 1)
+    number = seen.astype(samples.dtype)
+    through = jnp.square(jnp.clip((point - surface) / safe / 3, 0, 1))
+    return Votes(number, number * moving, number * agreement(surface, safe, point), number * through)
+
+
+def _geometry_votes(votes):
+    """(D, h, w, 4) over the frames that show something still, and (D, h, w) what they say of a surface here."""
+    still = votes.seen * (1 - votes.moving)
+    weight = jnp.maximum(jnp.sum(still, -1), 0.5)
+    surface = jnp.sum(still * votes.surface, -1) / weight
+    through = jnp.sum(still * votes.through, -1) / weight
+    count = votes.seen.shape[-1]
+    shares = [surface, through, jnp.sum(still, -1) / count, jnp.sum(votes.seen, -1) / count]
+    return jnp.stack(shares, -1), VOTE_GAIN * (surface - through)
+
+
+def _motion_votes(votes):
+    """(D, h, w, 3 V) slot by slot, and (D, h, w) what they say of a moving surface here."""
+    support = votes.moving * votes.surface
+    channels = jnp.concatenate([support, votes.moving, votes.through], -1)
+    weight = jnp.maximum(jnp.sum(votes.seen, -1), 0.5)
+    return channels, VOTE_GAIN * jnp.sum(support - votes.through, -1) / weight
+
+
+def encode_volume(params, views, camera, size, depths, *, colours, trusted, slots):
+    """Sweep, compare, encode.
+
+    Args:
+      params: `VolumeParams`.
+      views: `SweepViews`.
+      camera: reference `Camera` at the volume's resolution. size: (h, w).
+      depths: (D,) planes in the reference camera, world units.
+      colours, trusted, slots: as in `init_volume`.
+
+    Returns:
+      `Volume`.
+
+    Source: ZeST-NeRF eq. 1, eq. 2 (geometry volume), eq. 3 (motion volume).
+    Reference: ZeST-NeRF networks.py, MVSNet.
+    Differs from the reference: the motion volume is swept too (theirs stacks features unwarped); trusted views only.
+    """
+    sizes = check_shapes("encode_volume", tables=(views.tables, "V h w C"), depths=(depths, "D"))
+    grid = sweep_grid(*size)
+    hom = homographies(camera, views.cameras, depths) * views.valid[None, :, None, None]
+    tables, trust = views.tables, None
+    if trusted:
+        moving, inverse_depth, tolerance = (tables[..., k] for k in range(-TRUST_MAPS, 0))
+        trust = Trust(0.1 + 0.9 * moving if slots else 1 - moving, inverse_depth, tolerance)
+    kept = TRUST_MAPS if trusted else 3 * (colours == "all")
+    cost = cost_volume(tables, hom, grid, trust=trust, depths=depths if trusted else None, per_view=kept)
+    features = sizes["C"] - 3 - TRUST_MAPS * trusted
+    variance = jnp.log1p(100 * cost.variance) / 4
+    if colours == "all":
+        flat = cost.samples.reshape(*cost.samples.shape[:3], -1)
+        channels, vote = [cost.variance[..., :features], flat], 0
+    else:
+        count = cost.count[..., None] / sizes["V"]
+        mean = cost.mean[..., features : features + 3]
+        channels, vote = [variance[..., : features + 3], mean, count], 0
+    if trusted:
+        votes = cell_votes(cost.samples, hom, grid, depths)
+        extra, vote = (_motion_votes if slots else _geometry_votes)(votes)
+        channels.append(extra)
+    cells = cost_regulariser(params.regulariser, jnp.concatenate(channels, axis=-1))
+    if params.occupied is None:
+        return Volume(cells, None)
+    return Volume(cells, dense(params.occupied, cells)[..., 0] + vote)

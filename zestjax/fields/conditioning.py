@@ -1,0 +1,100 @@
+"""What the source views say about a point: their colours, and whether each can be trusted there.
+
+    V        source views (key-frames, or the neighbours of a time)
+    P        points
+    gap      how far a view's own surface lies in front of the point, in its tolerances: > 0 the point is hidden,
+             about 0 it is that surface, < 0 the view looks through it
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from zestjax.cameras import Camera, project
+from zestjax.checks import check_shapes
+from zestjax.numerics import safe_divide
+from zestjax.resample import bilinear_cells, corner_offsets, gather_corners, interpolate
+
+GAP_LIMIT = 3.0
+
+
+class SourceViews(NamedTuple):
+    """tables: (V, H, W, C): colour, then, of trusted views, probability of moving, inverse depth, its tolerance.
+    cameras: `Camera` (V, ...). valid: (V,) 1 or 0. times: (V,) frame time minus target time, frames."""
+
+    tables: jax.Array
+    cameras: Camera
+    valid: jax.Array
+    times: jax.Array
+
+
+class ViewSamples(NamedTuple):
+    """colour: (V, P, 3), 0 where not visible. visible: (V, P) 1 or 0. moving: (V, P) in [0, 1]. gap: (V, P) in
+    [-3, 3]. The last two are 0 of views without trust maps."""
+
+    colour: jax.Array
+    visible: jax.Array
+    moving: jax.Array
+    gap: jax.Array
+
+
+def sample_views(views, points):
+    """Every view's colour and trust maps where the points project to.
+
+    Four gathers of whole rows for all views at once, from one flat table.
+
+    Args:
+      views: `SourceViews`.
+      points: (V, P, 3) world, or (1, P, 3) for the same points in every view.
+
+    Returns:
+      `ViewSamples`.
+
+    Source: ZeST-NeRF section 3.2 (colours of the inputs as conditioning).
+    Differs from the reference: a point behind a camera is not visible in it.
+    """
+    sizes = check_shapes("sample_views", tables=(views.tables, "V H W C"), points=(points, "one P 3"))
+    count, height, width, channels = (sizes[a] for a in "VHWC")
+    cameras = jax.tree.map(lambda x: x[:, None], views.cameras)
+    pixels, depth, front = project(cameras, jnp.broadcast_to(points, (count, sizes["P"], 3)))
+    cells = bilinear_cells(pixels[..., 0], pixels[..., 1], height, width)
+    seen = cells.inside & front & (views.valid[:, None] > 0)
+    first = cells.first + (jnp.arange(count, dtype=jnp.int32) * (height * width))[:, None]
+    corners = gather_corners(views.tables.reshape(-1, channels), first, corner_offsets(height, width))
+    values = jnp.where(seen[..., None], interpolate(corners, cells.across, cells.down), 0)
+    visible = seen.astype(values.dtype)
+    if channels == 3:
+        return ViewSamples(values, visible, jnp.zeros_like(visible), jnp.zeros_like(visible))
+    surface, tolerance = values[..., 4], jnp.where(seen, values[..., 5], 1)
+    gap = jnp.clip((surface - 1 / jnp.where(seen, depth, 1)) / tolerance, -GAP_LIMIT, GAP_LIMIT)
+    return ViewSamples(values[..., :3], visible, values[..., 3], jnp.where(seen, gap, 0))
+
+
+def hidden(gap):
+    """Soft probability that a point at `gap` is hidden behind a view's surface, in [0, 1]; `trust.behind` of a gap."""
+    return -jnp.expm1(-jnp.square(jnp.maximum(gap, 0)))
+
+
+def on_surface(gap):
+    """Soft probability that a point at `gap` is the view's surface, in [0, 1]; `trust.agreement` of a gap."""
+    return jnp.exp(-jnp.square(gap))
+
+
+def over_views(weights, values):
+    """Weighted mean over views: (V, P), (V, P, C) -> (P, C); 0 where all weights are 0.
+
+    Written as a sum of products: sums over a leading axis are slow on a CPU.
+    """
+    total = sum(weights[v] for v in range(weights.shape[0]))
+    summed = sum(weights[v][:, None] * values[v] for v in range(weights.shape[0]))
+    return safe_divide(summed, total[:, None])
+
+
+def parallax(cameras, points, points_beyond):
+    """(V, P) pixels by which the views see two points of each target ray apart: 0 from the target's own position."""
+    cameras = jax.tree.map(lambda x: x[:, None], cameras)
+    here, beyond = project(cameras, points), project(cameras, points_beyond)
+    both = here.in_front & beyond.in_front
+    shift = jnp.where(both[..., None], here.pixels - beyond.pixels, 100.0)
+    return jnp.sum(jnp.abs(jax.lax.stop_gradient(shift)), axis=-1)

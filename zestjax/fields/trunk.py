@@ -1,0 +1,124 @@
+"""The trunk that both fields share: an MLP whose hidden state is modulated by the conditioning, and the view pooling.
+
+    P  points   F  conditioning features   Q  encoded direction   V  source views   U  channels per view
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from zestjax.checks import check_option
+from zestjax.nets.layers import Dense, dense, init_dense
+
+
+class Trunk(NamedTuple):
+    """layers: of Dense; one whose kernel takes more than the last gave, skips. condition: Dense, F to the width."""
+
+    layers: tuple[Dense, ...]
+    condition: Dense
+
+
+class ViewHead(NamedTuple):
+    """What is learned for one view and shared by all: lift (U -> width), query (trunk -> width), score (width -> 1)."""
+
+    lift: Dense
+    query: Dense
+    score: Dense
+
+
+class ColourHead(NamedTuple):
+    """feature: Dense. hidden: Dense on features and direction. colour: Dense to 3 raw channels."""
+
+    feature: Dense
+    hidden: Dense
+    colour: Dense
+
+
+def init_trunk(key, n_in, n_condition, *, width, depth):
+    """A trunk of `depth` layers; from six layers on, the input is joined again after the fifth, as in NeRF."""
+    keys = jax.random.split(key, depth + 1)
+    skip = 5 if depth > 5 else -1
+    sizes = [n_in if i == 0 else width + n_in * (i == skip) for i in range(depth)]
+    layers = tuple(init_dense(k, size, width) for k, size in zip(keys[:-1], sizes, strict=True))
+    condition = init_dense(keys[-1], n_condition, width, scale=0.5)
+    return Trunk(layers, condition._replace(bias=jnp.ones_like(condition.bias)))
+
+
+def trunk(params, x, condition, *, conditioning="multiply"):
+    """Hidden state of each point: relu(layer(h) * condition), layer by layer.
+
+    Args:
+      params: `Trunk`.
+      x: (P, n) encoded position.
+      condition: (P, F).
+      conditioning: `multiply`, or `add` as the paper prints it.
+
+    Returns:
+      (P, width).
+
+    Source: ZeST-NeRF appendix, MLP table.
+    Reference: ZeST-NeRF networks.py; MVSNeRF models.py (multiplies).
+    """
+    check_option("trunk", conditioning=(conditioning, ("multiply", "add")))
+    modulation = dense(params.condition, condition)
+    hidden = x
+    for layer in params.layers:
+        if layer.kernel.shape[0] > hidden.shape[-1]:
+            hidden = jnp.concatenate([x, hidden], axis=-1)
+        hidden = dense(layer, hidden)
+        hidden = jax.nn.relu(hidden * modulation if conditioning == "multiply" else hidden + modulation)
+    return hidden
+
+
+def init_view_head(key, n_view, n_hidden, *, width=16):
+    """Parameters of the per-view network."""
+    lift, query, score = jax.random.split(key, 3)
+    return ViewHead(
+        init_dense(lift, n_view, width), init_dense(query, n_hidden, width), init_dense(score, width, 1, scale=0.3)
+    )
+
+
+def lifted(params, features):
+    """(V, P, U) -> (V, P, width) before any activation."""
+    return dense(params.lift, features)
+
+
+def view_scores(params, features, hidden):
+    """(V, P) logits with which each view's colour is chosen, from its own lifted features and the point's state."""
+    query = dense(params.query, hidden)
+    return dense(params.score, jax.nn.relu(features + query[None]))[..., 0]
+
+
+def blend_of_views(scores, prior, visible, colour):
+    """Softmax over the views that see a point of their colours.
+
+    Args:
+      scores: (V, P) logits. prior: (V, P) >= 0 trust that multiplies the softmax. visible: (V, P) 1 or 0.
+      colour: (V, P, 3).
+
+    Returns:
+      (P, 3); 0 where no view sees the point.
+    """
+    scores = 8 * jnp.tanh(scores / 8)  # bounded, so that no maximum over views is needed
+    weights = jnp.exp(scores) * (prior + 1e-4) * visible
+    views = range(weights.shape[0])
+    total = sum(weights[v] for v in views)
+    mean = sum(weights[v][:, None] * colour[v] for v in views)
+    return mean / jnp.maximum(total, 1e-9)[:, None]
+
+
+def init_colour_head(key, n_hidden, n_view):
+    """The paper's head: a linear map, then direction joined, half the width, three channels."""
+    a, b, c = jax.random.split(key, 3)
+    return ColourHead(
+        init_dense(a, n_hidden, n_hidden),
+        init_dense(b, n_hidden + n_view, max(n_hidden // 2, 4)),
+        init_dense(c, max(n_hidden // 2, 4), 3),
+    )
+
+
+def direct_colour(params, hidden, direction):
+    """(P, 3) in (0, 1) from the state and the encoded direction."""
+    features = jnp.concatenate([dense(params.feature, hidden), direction], axis=-1)
+    return jax.nn.sigmoid(dense(params.colour, jax.nn.relu(dense(params.hidden, features))))
