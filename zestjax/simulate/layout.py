@@ -1,0 +1,156 @@
+"""Putting scenes together on the host, body by body.
+
+Layout axes are those of the rig's middle camera at time 0: x right, y down, z forward. Lengths are the
+scene's units. A `Layout` collects bodies and pads them to fixed counts, so that every scene of one layout
+size runs in one compiled program.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zestjax.simulate.types import Bodies, Motion, Scene
+
+BOXES, BALLS = 18, 10
+
+
+class Body(NamedTuple):
+    """One body in plain numbers; see `Bodies` and `Motion` for the fields."""
+
+    shape: np.ndarray
+    textures: tuple
+    hollow: bool = False
+    tile: float = 1.0
+    offset: tuple = (0.0, 0.0)
+    tint: tuple = (1.0, 1.0, 1.0)
+    gloss: float = 0.0
+    position: tuple = (0.0, 0.0, 0.0)
+    turn: float = 0.0
+    parent: int | None = None
+    velocity: tuple = (0.0, 0.0, 0.0)
+    sway: tuple = (0.0, 0.0, 0.0)
+    spin: tuple = (0.0, 0.0, 0.0)
+    swing: tuple = (0.0, 0.0, 0.0)
+    strain: tuple = ((0.0, 0.0, 0.0),) * 3
+    rate: float = 0.0
+    phase: float = 0.0
+
+
+def affine(linear=None, offset=(0, 0, 0)):
+    """(4, 4) float32 matrix."""
+    matrix = np.eye(4, dtype=np.float32)
+    matrix[:3, :3] = np.eye(3) if linear is None else linear
+    matrix[:3, 3] = offset
+    return matrix
+
+
+def turned(angle):
+    """(3, 3) rotation about the vertical axis."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]], np.float32)
+
+
+def sized(half, offset=(0, 0, 0)):
+    """Shape of a body of half-lengths `half` whose middle is at `offset` in its joint."""
+    return affine(np.diag(np.asarray(half, np.float32)), offset)
+
+
+class Layout:
+    """Collects bodies; `scene` gives the arrays.
+
+    `box` and `ball` return the body's handle, which serves as the `parent` of another body.
+    """
+
+    def __init__(self):
+        self._boxes, self._balls = [], []
+
+    def box(self, **fields):
+        """Add a box; the fields are `Body`'s."""
+        return self._add(self._boxes, "box", fields)
+
+    def ball(self, **fields):
+        """Add a ball or an ellipsoid; the fields are `Body`'s."""
+        return self._add(self._balls, "ball", fields)
+
+    def room_for(self, *, boxes=0, balls=0):
+        """Would so many more bodies fit?"""
+        return len(self._boxes) + boxes <= BOXES and len(self._balls) + balls <= BALLS
+
+    @staticmethod
+    def _add(bodies, kind, fields):
+        bodies.append(Body(**fields))
+        return kind, len(bodies) - 1
+
+    def scene(self, *, atlas, light, ambient, effects, boxes=BOXES, balls=BALLS, mid_time=0.0, unit=1.0):
+        """The `Scene`.
+
+        Args:
+          atlas: packed texels. light: position. ambient: share. effects: `Effects`.
+          boxes, balls: counts to pad to with absent bodies.
+          mid_time: the time at which bodies with a velocity or a spin pass their given position.
+          unit: world units per layout unit.
+
+        Raises:
+          ValueError: where more bodies were added than fit.
+        """
+        for kind, count, most in (("boxes", len(self._boxes), boxes), ("balls", len(self._balls), balls)):
+            if count > most:
+                raise ValueError(f"Layout.scene: {count} {kind}, expected at most {most}.")
+        index = lambda handle: -1 if handle is None else handle[1] + (boxes if handle[0] == "ball" else 0)
+        parts = [
+            _table(bodies, count, index, mid_time, unit)
+            for bodies, count in ((self._boxes, boxes), (self._balls, balls))
+        ]
+        light = np.asarray(light, np.float32) * np.float32(unit)
+        return Scene(*parts, np.asarray(atlas), light, np.float32(ambient), effects)
+
+
+def _scaled(matrix, unit, *, offset_only=False):
+    matrix = np.array(matrix, np.float32)
+    matrix[:3, 3 if offset_only else slice(None)] *= unit
+    return matrix
+
+
+def _rows(body, index, mid_time, unit):
+    """The arrays of one body; see `Layout.scene`."""
+    extent = np.linalg.norm(np.asarray(body.shape)[:3, :3], axis=0)
+    position = np.asarray(body.position) - mid_time * turned(body.turn) @ np.asarray(body.velocity)
+    motion = Motion(
+        joint=_scaled(affine(turned(body.turn), position), unit, offset_only=True),
+        parent=np.int32(index(body.parent)),
+        velocity=np.asarray(body.velocity) * unit,
+        sway=np.asarray(body.sway) * unit,
+        spin=np.asarray(body.spin),
+        swing=np.asarray(body.swing),
+        strain=np.asarray(body.strain),
+        rate=body.rate,
+        phase=body.phase,
+    )
+    textures = body.textures if len(body.textures) == 3 else body.textures * 3
+    return Bodies(
+        shape=_scaled(body.shape, unit),
+        present=True,
+        hollow=body.hollow,
+        texture=np.asarray(textures, np.int32),
+        tiling=extent / body.tile,
+        offset=np.asarray(body.offset),
+        tint=np.asarray(body.tint),
+        gloss=body.gloss,
+        motion=motion,
+    )
+
+
+def _table(bodies, count, index, mid_time, unit):
+    """`Bodies` of `count` rows, the ones not in use absent."""
+    absent = Body(sized((1, 1, 1)), (0,))
+    rows = [_rows(body, index, mid_time, unit) for body in bodies]
+    rows += [_rows(absent, index, mid_time, unit)._replace(present=False)] * (count - len(bodies))
+    flat = [_flat(row) for row in rows]
+    columns = [np.stack([np.asarray(row[i]) for row in flat]) for i in range(len(flat[0]))]
+    columns = [c.astype(np.float32) if c.dtype == np.float64 else c for c in columns]
+    motion = Motion(*columns[len(Bodies._fields) - 1 :])
+    return Bodies(*columns[: len(Bodies._fields) - 1], motion)
+
+
+def _flat(row):
+    return (*row[:-1], *row.motion)

@@ -1,0 +1,106 @@
+"""What a simulated scene is: arrays only, so that scenes of one shape share one compiled program.
+
+    B        bodies: boxes first, then balls
+    N        times a scene has tables for
+    T        texels of the packed atlas, all levels
+    unit body  the box [-1, 1]^3 or the ball of radius 1
+"""
+
+from typing import NamedTuple
+
+import jax
+
+
+class Motion(NamedTuple):
+    """How each body's joint moves; `zestjax.simulate.motion` turns it into matrices.
+
+    With s = sin(rate * t + phase): offset = velocity * t + sway * s, rotation vector = spin * t + swing * s,
+    stretch = identity + strain * s. A chain of joints inherits offsets and rotations, not stretches.
+
+    joint: (B, 4, 4) parent_from_joint before any motion, rigid.
+    parent: (B,) int32 number of the parent body, -1 for the world.
+    velocity, sway: (B, 3) world units per frame, world units, in the axes of the resting joint.
+    spin, swing: (B, 3) radians per frame, radians.
+    strain: (B, 3, 3) relative stretch and shear.
+    rate, phase: (B,) radians per frame, radians.
+    """
+
+    joint: jax.Array
+    parent: jax.Array
+    velocity: jax.Array
+    sway: jax.Array
+    spin: jax.Array
+    swing: jax.Array
+    strain: jax.Array
+    rate: jax.Array
+    phase: jax.Array
+
+
+class Bodies(NamedTuple):
+    """Shapes, looks and motion of the bodies of one kind.
+
+    shape: (B, 4, 4) joint_from_unit, affine and never singular.
+    present: (B,) bool; an absent body is seen by no ray.
+    hollow: (B,) bool; seen from inside, casts no shadow: the room around a scene.
+    texture: (B, 3) int32 atlas slot of the faces across x, y and z.
+    tiling: (B, 3) texture tiles per unit-body half-length.
+    offset: (B, 2) texture tiles.
+    tint: (B, 3) factor on the texture.
+    gloss: (B,) strength of the highlight in [0, 1]; used where the scene has highlights.
+    motion: `Motion`.
+    """
+
+    shape: jax.Array
+    present: jax.Array
+    hollow: jax.Array
+    texture: jax.Array
+    tiling: jax.Array
+    offset: jax.Array
+    tint: jax.Array
+    gloss: jax.Array
+    motion: Motion
+
+
+class Effects(NamedTuple):
+    """Effects as data; None is absent from the compiled program.
+
+    shadows: () darkness of cast shadows in [0, 1].
+    specular: () factor on the bodies' gloss.
+    motion_blur: () shutter time in frames; bodies blur, the camera does not.
+    exposure: (N, 3) gain of each time and channel.
+    noise: () standard deviation of the sensor's noise, applied only where a key is given.
+    """
+
+    shadows: jax.Array | None = None
+    specular: jax.Array | None = None
+    motion_blur: jax.Array | None = None
+    exposure: jax.Array | None = None
+    noise: jax.Array | None = None
+
+
+class Scene(NamedTuple):
+    """boxes, balls: `Bodies`. atlas: (T,) uint32 packed texels (`zestjax.simulate.textures`). light: (3,) world
+    position of the point light. ambient: () share of light that comes from everywhere, in [0, 1].
+    effects: `Effects`."""
+
+    boxes: Bodies
+    balls: Bodies
+    atlas: jax.Array
+    light: jax.Array
+    ambient: jax.Array
+    effects: Effects
+
+
+class Frame(NamedTuple):
+    """What one camera sees at one time.
+
+    image: (H, W, 3) RGB in [0, 1], anti-aliased.
+    depth: (H, W) z at the pixel's centre, world units; infinite where a ray hits nothing.
+    body: (H, W) int32 number of the body at the pixel's centre, -1 where a ray hits nothing.
+    point: (H, W, 3) world point at the pixel's centre.
+    """
+
+    image: jax.Array
+    depth: jax.Array
+    body: jax.Array
+    point: jax.Array
