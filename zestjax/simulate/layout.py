@@ -11,7 +11,7 @@ import numpy as np
 
 from zestjax.simulate.types import Bodies, Motion, Scene
 
-BOXES, BALLS = 18, 10
+BOXES, BALLS = 20, 10
 
 
 class Body(NamedTuple):

@@ -63,7 +63,8 @@ def add_room(layout, rng, view, *, half_width, ceiling, behind, **motion):
 
 
 def add_standing(layout, rng, view, *, z, x, kind, motion=None):
-    """Something still: "block", "ball", "pole", "panel", "beam" or "hanging" (a ball or a block in mid-air)."""
+    """Something still: "block", "ball", "pole", "panel", "beam", "tower" (a large block) or "hanging" (a
+    ball or a block in mid-air)."""
     motion = motion or {}
     width = view.width(z)
     turn = rng.uniform(-0.8, 0.8)
@@ -75,8 +76,10 @@ def add_standing(layout, rng, view, *, z, x, kind, motion=None):
         half = np.array([width * rng.uniform(0.15, 0.5), width * rng.uniform(0.002, 0.012), width * 0.004])
     elif kind == "panel":
         half = np.array([width * rng.uniform(0.1, 0.3), width * rng.uniform(0.08, 0.25), width * 0.006])
+    elif kind == "tower":
+        half = width * rng.uniform([0.05, 0.15, 0.03], [0.2, 0.45, 0.1])
     else:
-        half = width * log_uniform(rng, 0.03, 0.13) * rng.uniform(0.6, 1.4, 3)
+        half = width * log_uniform(rng, 0.03, 0.15) * rng.uniform(0.6, 1.4, 3)
     floating = kind in ("hanging", "beam")
     y = rng.uniform(-0.7, 0.1) * view.down * z if floating else view.floor - half[1]
     look = finish(rng, view, z, float(half.max()))

@@ -11,11 +11,13 @@ rigs, arcs and hands, static scenes, scenes in which everything moves, dark ones
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from zestjax.cameras import Camera
+from zestjax.cameras import Camera, scaled
 from zestjax.simulate import props, rigs
 from zestjax.simulate.layout import Layout
+from zestjax.simulate.render import render
 from zestjax.simulate.textures import random_atlas
 from zestjax.simulate.types import Effects, Scene
 
@@ -46,7 +48,8 @@ def random_scene(key, *, height, width, frames=16, targets=8):
     """
     rng = generator(key)
     unit = props.log_uniform(rng, 0.2, 10)
-    view = _random_view(rng, height / width)
+    aim = rng.normal(0, 1, 3) * [0.12, 0.07, 0.01] + [0, 0.03, 0]
+    view = _random_view(rng, height / width, aim[1])
     intrinsics = rigs.intrinsics_from_view(height, width, view.across)
     at = lambda positions, angles: rigs.cameras_at(positions, angles, intrinsics, unit=unit)
     places = _random_places(rng, view, frames, targets)
@@ -58,16 +61,30 @@ def random_scene(key, *, height, width, frames=16, targets=8):
         atlas=random_atlas(rng, "training"), light=light, ambient=rng.uniform(0.35, 0.85),
         effects=_random_effects(rng, frames), mid_time=(frames - 1) / 2, unit=unit,
     )  # fmt: skip
-    cameras, wanted = at(places.positions, places.angles), at(places.target_positions, places.target_angles)
+    cameras, wanted = at(places.positions, places.angles + aim), at(places.target_positions, places.target_angles + aim)
+    brightness = rng.uniform(0.06, 0.2) if rng.random() < 0.12 else rng.uniform(0.28, 0.55)
+    scene = _exposed(scene, Camera(*(leaf[frames // 2] for leaf in cameras)), brightness, height, width)
     return RandomScene(scene, cameras, wanted, places.target_times.astype(np.int32))
 
 
-def _random_view(rng, aspect):
+_probe = jax.jit(render, static_argnames=("height", "width", "samples"))
+
+
+def _exposed(scene, camera, brightness, height, width, *, share=4):
+    """The scene with its exposure such that the camera's image has a mean brightness, as a camera's automatic has."""
+    small = scaled(camera, np.float32(1 / share), np.float32(1 / share))
+    dim = scene._replace(effects=scene.effects._replace(exposure=np.full_like(scene.effects.exposure, 0.25)))
+    mean = 4 * float(jnp.mean(_probe(dim, small, 0.0, height=height // share, width=width // share, samples=1).image))
+    gain = np.float32(np.clip(brightness / max(mean, 1e-3), 0.2, 4.0))
+    return scene._replace(effects=scene.effects._replace(exposure=scene.effects.exposure * gain))
+
+
+def _random_view(rng, aspect, pitch):
     wide = rng.random() < 0.5
     across = np.tan(np.radians(rng.uniform(60, 90) if wide else rng.uniform(35, 60)) / 2)
     down = across * aspect
-    reach = props.log_uniform(rng, 2.0, 26.0)
-    return props.View(across, down, down * rng.uniform(1.05, 2.4), reach)
+    reach = props.log_uniform(rng, 2.0, 24.0)
+    return props.View(across, down, (down + max(pitch, 0)) * rng.uniform(1.05, 2.4), reach)
 
 
 class _Places(NamedTuple):
@@ -106,8 +123,6 @@ def _random_places(rng, view, frames, targets):
 def _random_effects(rng, frames):
     """Every effect is in the program; its strength may be 0."""
     exposure = np.ones((frames, 3))
-    if rng.random() < 0.15:
-        exposure *= rng.uniform(0.2, 0.55)
     if rng.random() < 0.3:
         exposure *= 1 + rng.uniform(0.02, 0.12) * rigs.smooth_walk(rng, frames, 1)
         exposure *= 1 + rng.uniform(0.0, 0.03) * rng.normal(0, 1, (frames, 1)) + rng.normal(0, 0.005, (frames, 3))
@@ -125,26 +140,29 @@ def _fill(layout, rng, view, frames, farthest):
     everything = rng.random() < 0.05
     speed = props.log_uniform(rng, 0.001, 0.05)
 
-    def drift(z):
+    def drift(z, turn=0.0):
         if not everything:
             return {}
-        sway = rng.normal(0, 0.5, 3) * view.width(z) * speed * 4
-        return dict(sway=sway, swing=rng.normal(0, 0.04, 3), rate=rng.uniform(0.2, 0.5), phase=rng.uniform(0, 6.3))
+        sway = rng.normal(0, 1.5, 3) * [1, 0, 0.5] * view.width(z) * speed
+        return dict(sway=sway, swing=(0, turn, 0), rate=rng.uniform(0.2, 0.5), phase=rng.uniform(0, 6.3))
 
     half_width = max(view.across * view.reach * rng.uniform(0.55, 1.3), farthest + 1.2)
     ceiling = max(view.down * view.reach * rng.uniform(0.75, 1.6), 0.8)
     props.add_room(
         layout, rng, view, half_width=half_width, ceiling=ceiling, behind=3 + 0.2 * view.reach,
-        **({**drift(view.reach), "strain": 0.06 * rng.normal(0, 1, (3, 3))} if everything else {}),
+        **drift(min(view.reach, 3), rng.normal(0, 0.03)),
     )  # fmt: skip
+    for _ in range(rng.integers(0, 4)):
+        z = view.reach * rng.uniform(0.6, 0.9)
+        props.add_standing(layout, rng, view, z=z, x=rng.uniform(-1, 1), kind="tower", motion=drift(z, rng.normal(0, 0.15)))
     kinds = ("block", "block", "ball", "pole", "panel", "beam", "hanging", "block")
-    for _ in range(rng.integers(4, 10)):
+    for _ in range(rng.integers(3, 9)):
         z = props.log_uniform(rng, 1.15, 0.93 * view.reach)
         kind = kinds[rng.integers(len(kinds))]
-        props.add_standing(layout, rng, view, z=z, x=rng.uniform(-1, 1), kind=kind, motion=drift(z))
+        props.add_standing(layout, rng, view, z=z, x=rng.uniform(-1, 1), kind=kind, motion=drift(z, rng.normal(0, 0.15)))
     if rng.random() < 0.16 and not everything:
         return
-    for _ in range(1 + rng.poisson(1.3)):
+    for _ in range(1 + rng.poisson(1.5)):
         _add_mover(layout, rng, view, frames, speed * props.log_uniform(rng, 0.5, 2))
 
 
@@ -177,4 +195,4 @@ def _add_mover(layout, rng, view, frames, speed):
 
 def log_size(rng):
     """Half-length of a mover as a share of the view's width."""
-    return props.log_uniform(rng, 0.035, 0.13)
+    return props.log_uniform(rng, 0.04, 0.19)

@@ -108,7 +108,8 @@ def shaded(scene, bodies, placed, hit, origin, direction, sample_angle):
     lit = jnp.maximum(dot(seen.normal, light), 0)
     if effects.shadows is not None:
         start = along(seen.point, 2e-3 * seen.distance, seen.normal)
-        lit = lit * (1 - effects.shadows * blocked(placed, start, towards, boxes=boxes).astype(lit.dtype))
+        dark = lambda: 1 - effects.shadows * blocked(placed, start, towards, boxes=boxes).astype(lit.dtype)
+        lit = lit * jax.lax.cond(effects.shadows > 0, dark, lambda: jnp.ones_like(lit))
     brightness, shine = scene.ambient + (1 - scene.ambient) * lit, 0
     if effects.specular is not None:
         halfway = normalized(tuple(a + b for a, b in zip(light, backwards, strict=True)))

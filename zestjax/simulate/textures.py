@@ -18,7 +18,7 @@ SLOTS = 12
 PHOTOGRAPHS = {
     "training": (
         ("astronaut.png", "coffee.png", "ihc.png", "gravel.png", "camera.png", "moon.png")
-        + ("hubble_deep_field.jpg", "cell.png", "logo.png", "color.png", "microaneurysms.png")
+        + ("hubble_deep_field.jpg", "cell.png", "logo.png", "microaneurysms.png")
     ),
     "bench": ("chelsea.png", "retina.jpg", "brick.png", "grass.png", "coins.png", "rocket.jpg", "text.png"),
 }
