@@ -11,6 +11,8 @@ import zestjax
 from zestjax import learn
 from zestjax.apps.clips import ClipSource, ClipSpec, clip_folder
 from zestjax.apps.loop import LoopOptions, run_loop
+from zestjax.apps.weights import SYSTEMS
+from zestjax.checks import check_option
 from zestjax.io.weights import load_weights
 from zestjax.presets import preset as preset_of
 from zestjax.training import TrainState, batch_key, clip_index, clip_window
@@ -26,7 +28,7 @@ class TrainOptions:
     weights: start from these. clips: folder of rendered clips, kept; None: the cache, where used ones are removed.
     clip_count: reuse that many clips; None: new ones for ever. window: clips alive at a time.
     steps_per_clip: steps between one new clip and the next. checkpoint_minutes: between two checkpoints.
-    changes: fields of the preset replaced.
+    system: one of `weights.SYSTEMS`.
     """
 
     out: Path
@@ -43,7 +45,7 @@ class TrainOptions:
     steps_per_clip: int = 4
     checkpoint_minutes: float = 5.0
     quiet: bool = False
-    changes: tuple = ()
+    system: str = "zest"
 
 
 class Summary(NamedTuple):
@@ -63,7 +65,8 @@ def train(options):
     Raises:
       ValueError, WeightsError: bad options; the folder holds another run; a damaged checkpoint.
     """
-    config = preset_of(options.preset, **dict(options.changes))
+    check_option("train", system=(options.system, tuple(SYSTEMS)))
+    config = preset_of(options.preset, **SYSTEMS[options.system])
     state, step_fn = fresh(config, options)
     metadata = run_metadata(config, options)
     limit = None if options.minutes is None else 60 * options.minutes
@@ -90,7 +93,8 @@ def run_metadata(config, options):
     data |= {"window": options.window, "steps_per_clip": options.steps_per_clip}
     config = {name: list(v) if isinstance(v, tuple) else v for name, v in dataclasses.asdict(config).items()}
     return {
-        "preset": options.preset, "config": config, "seed": options.seed, "steps": options.steps, "data": data,
+        "preset": options.preset, "system": options.system, "config": config, "seed": options.seed,
+        "steps": options.steps, "data": data,
         "start": None if options.weights is None else str(options.weights), "zestjax": zestjax.__version__,
         "jax": jax.__version__, "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
     }  # fmt: skip

@@ -1,0 +1,181 @@
+"""`zestjax evaluate`: a model's views of cameras and times the inputs never contained, scored beside floors.
+
+Every score carries its seconds: of one frame, the volumes of its target included, after a first call that compiles;
+what is done once for a video (`prepare`) and the compile stand beside them.
+"""
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zestjax import floors, novel_view
+from zestjax.apps.progress import progress
+from zestjax.apps.scenes import open_scene
+from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
+from zestjax.apps.tables import headline, write_table
+from zestjax.apps.weights import open_weights
+from zestjax.io.files import write_bytes
+from zestjax.io.inputs import check_target
+from zestjax.io.pictures import depth_picture, error_picture, share_picture, side_by_side, write_image
+
+LABELS = ("nearest input", "novel view", "truth", "error", "depth", "dynamicness")
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateOptions:
+    """The flags of `zestjax evaluate`; see the command's help. targets: times, or None for the protocol's own."""
+
+    scene: str
+    out: Path
+    weights: Path | None = None
+    system: str | None = None
+    protocol: str = "held-out"
+    size: tuple | None = None
+    targets: tuple | None = None
+    format: str | None = None
+    pictures: bool = True
+    seed: int = 0
+    quiet: bool = False
+
+
+def evaluate(options):
+    """Run `zestjax evaluate`; `bench:all` is all nine scenes of zest-bench and a table.
+
+    Returns:
+      str, the summary line.
+
+    Raises:
+      ValueError, WeightsError: a scene, a target or weights that cannot be used.
+    """
+    model = open_weights(options.weights, system=options.system)
+    if options.scene != "bench:all":
+        report = evaluate_scene(model, options, options.out)
+        return f"evaluate: {headline(report)}: {Path(options.out) / 'metrics.json'}"
+    from zestjax.simulate.bench import BENCH
+
+    out, reports = Path(options.out), []
+    for name in BENCH:
+        reports.append(evaluate_scene(model, dataclasses.replace(options, scene=f"bench:{name}"), out / name))
+        write_table(out, reports)
+    return f"evaluate: mean of {len(reports)} scenes: {headline(write_table(out, reports))}: {out / 'table.md'}"
+
+
+def evaluate_scene(model, options, out):
+    """Score one scene and write `metrics.json` and `pictures/`.
+
+    Returns:
+      dict, the content of metrics.json.
+    """
+    opened = open_scene(options.scene, model.config, size=options.size, protocol=options.protocol,
+                        targets=options.targets, layout=options.format)  # fmt: skip
+    scene, out, rows = opened.scene, Path(options.out if out is None else out), []
+    view_of = Renderer(model, scene.video)
+    for target in progress(scene.targets, scene.name, quiet=options.quiet):
+        check_target(scene.name, scene.video, target.camera)
+        rows.append(evaluate_target(view_of, scene, target, opened.ceiling, out if options.pictures else None))
+    height, width = scene.video.images.shape[1:3]
+    report = {
+        "scene": scene.name, "system": model.system, "protocol": options.protocol, "height": height, "width": width,
+        "preset": model.config.name, "device": device_name(), "weights": str(model.path),
+        **summary(rows), "prepare_seconds": number(view_of.prepare_seconds),
+        "compile_seconds": number(view_of.compile_seconds), "targets": [row["row"] for row in rows],
+    }  # fmt: skip
+    write_bytes(out / "metrics.json", (json.dumps(report, indent=1) + "\n").encode())
+    return report
+
+
+class Renderer:
+    """Views of one prepared video, timed; the first is rendered twice, so that no compile is counted as rendering."""
+
+    def __init__(self, model, video):
+        self.model, self.compile_seconds = model, None
+        self.video = jax.tree.map(jnp.asarray, video)
+        prepare = lambda: jax.block_until_ready(novel_view.prepare(model.params, self.video, config=model.config))
+        self.prepared, first = timed(prepare)
+        self.prepared, self.prepare_seconds = timed(prepare)
+        self.prepare_compile_seconds = max(0.0, first - self.prepare_seconds)
+
+    def __call__(self, camera, frame_time, exclude=()):
+        """(`View`, seconds)."""
+        camera = jax.tree.map(jnp.asarray, camera)
+        render = lambda: jax.block_until_ready(
+            novel_view.render_view(
+                self.model.params, self.prepared, camera, frame_time, config=self.model.config, exclude=exclude
+            )
+        )
+        view, seconds = timed(render)
+        if self.compile_seconds is None:
+            first = seconds
+            view, seconds = timed(render)
+            self.compile_seconds = self.prepare_compile_seconds + max(0.0, first - seconds)
+        return view, seconds
+
+
+def evaluate_target(view_of, scene, target, ceiling, out):
+    """One target's row of metrics.json under `row`, and its floors' and ceiling's scores; writes its picture."""
+    view, seconds = view_of(target.camera, target.time, target.exclude)
+    nearest, warped = floor_images(view_of.video, target)
+    score = lambda image: score_image(image, target.image, target.dynamic)
+    limit = None if ceiling is None else ceiling(target)
+    name = f"pictures/{target.time:05d}_{target.camera_name}.png"
+    if out is not None:
+        write_image(out / name, picture_of(nearest, view, target, scene.video))
+    row = {
+        "time": int(target.time), "camera": target.camera_name, **score(view.colour),
+        "depth_abs_rel": score_depth(view.depth, target.depth),
+        "flow_epe_px": score_flow(getattr(view, "flow", None), target.flow),
+        "seconds": number(seconds), "file": name if out is not None else None,
+    }  # fmt: skip
+    extra = None if limit is None else score(limit.image) | {"unseen": number(limit.unseen)}
+    return {"row": row, "nearest_frame": score(nearest), "plane_warp": score(warped), "ceiling": extra}
+
+
+def summary(rows):
+    """The means over the targets: `mean`, `floors` and `ceiling` of metrics.json."""
+    mean = mean_scores([{k: v for k, v in r["row"].items() if k not in ("time", "camera", "file")} for r in rows])
+    mean["seconds_per_frame"] = mean.pop("seconds")
+    return {
+        "mean": mean,
+        "floors": {name: mean_scores([r[name] for r in rows]) for name in ("nearest_frame", "plane_warp")},
+        "ceiling": mean_scores([r["ceiling"] for r in rows]),
+    }
+
+
+@jax.jit
+def _floors(video, camera, frame_time, exclude):
+    nearest = floors.nearest_frame(video, camera, frame_time, exclude=exclude)
+    return nearest.image, floors.plane_warp(video, camera, frame_time, exclude=exclude).image
+
+
+def floor_images(video, target):
+    """The nearest frame and the plane warp of a target, numpy (H, W, 3)."""
+    exclude = jnp.asarray(target.exclude, jnp.int32).reshape(-1)
+    camera = jax.tree.map(jnp.asarray, target.camera)
+    return tuple(np.asarray(image) for image in _floors(video, camera, jnp.int32(target.time), exclude))
+
+
+def picture_of(nearest, view, target, video):
+    """Nearest input, novel view, truth, error, depth and dynamicness of one target, side by side."""
+    image = np.clip(np.asarray(view.colour, np.float32), 0, 1)
+    truth = np.asarray(target.image, np.float32)
+    depth = depth_picture(np.asarray(view.depth), near=float(video.near), far=float(video.far))
+    pictures = [nearest, image, truth, error_picture(image, truth), depth, share_picture(np.asarray(view.dynamicness))]
+    return side_by_side(pictures, labels=LABELS, columns=3)
+
+
+def timed(function):
+    """(result, seconds)."""
+    start = time.perf_counter()
+    result = function()
+    return result, time.perf_counter() - start
+
+
+def device_name():
+    """What computed: the platform and the device's own name."""
+    device = jax.devices()[0]
+    return f"{device.platform} ({device.device_kind})"

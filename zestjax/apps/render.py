@@ -1,0 +1,130 @@
+"""`zestjax render`: a camera path through a video, as pictures and as a film."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from zestjax.apps.evaluate import Renderer, device_name
+from zestjax.apps.paths import camera_path
+from zestjax.apps.progress import progress
+from zestjax.apps.scenes import open_scene
+from zestjax.apps.scoring import number
+from zestjax.apps.weights import open_weights
+from zestjax.cameras import resized
+from zestjax.io.files import write_bytes
+from zestjax.io.inputs import check_target
+from zestjax.io.pictures import resize_area, write_image
+from zestjax.io.video import write_video
+
+SCALES = (1.0, 0.75, 0.5, 0.375)
+"""Sizes that a time budget may fall back to; pictures are enlarged to the size asked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderOptions:
+    """The flags of `zestjax render`; see the command's help. frames: of the path; budget_seconds: for all of them."""
+
+    scene: str
+    out: Path
+    weights: Path | None = None
+    path: str = "orbit"
+    frames: int | None = None
+    size: tuple | None = None
+    budget_seconds: float | None = None
+    format: str | None = None
+    fps: float = 12.0
+    seed: int = 0
+    quiet: bool = False
+
+
+def render(options):
+    """Run `zestjax render`.
+
+    Returns:
+      str, the summary line.
+
+    Raises:
+      ValueError, WeightsError: a scene, a path or weights that cannot be used.
+    """
+    model, out = open_weights(options.weights), Path(options.out)
+    scene = open_scene(options.scene, model.config, size=options.size, protocol=None, layout=options.format).scene
+    path = camera_path(options.path, scene.video, count=options.frames)
+    views, timing = render_path(model, scene, path, budget=options.budget_seconds, quiet=options.quiet)
+    pictures = np.stack([np.clip(np.asarray(view.colour, np.float32), 0, 1) for view in views])
+    size = scene.video.images.shape[1:3]
+    pictures = np.stack([resize_area(picture, *size) for picture in pictures])
+    for i, picture in enumerate(pictures):
+        write_image(out / f"frames/{i:05d}.png", picture)
+    film = write_video(out / "video", pictures, fps=options.fps)
+    timing = {
+        "scene": scene.name,
+        "path": options.path,
+        "height": size[0],
+        "width": size[1],
+        **timing,
+        "video": film.name,
+    }
+    write_bytes(out / "timing.json", (json.dumps(timing, indent=1) + "\n").encode())
+    return (
+        f"render: {len(views)} frames of {size[0]}x{size[1]}, {timing['seconds_per_frame']:.2f} s each "
+        f"(compile {timing['compile_seconds']:.0f} s): {film}"
+    )
+
+
+def render_path(model, scene, path, *, budget=None, quiet=False):
+    """The `View`s along a `CameraPath` and their timing; within `budget` seconds for all of them, if given.
+
+    Returns:
+      (list of `View`, dict).
+
+    Raises:
+      ValueError: a camera that sees nothing of what the inputs see.
+    """
+    for index in range(len(path.times)):
+        check_target(scene.name, scene.video, camera_at(path, index))
+    view_of, factors = _within(model, scene.video, path, budget)
+    views, seconds = [], []
+    for index in progress(range(len(path.times)), "render", quiet=quiet):
+        view, spent = view_of(resized(camera_at(path, index), *factors), int(path.times[index]), ())
+        views.append(view)
+        seconds.append(spent)
+    timing = {
+        "device": device_name(), "preset": model.config.name, "frames": len(views), "scale": number(factors[1]),
+        "seconds_per_frame": number(np.median(seconds)), "seconds": number(sum(seconds)),
+        "prepare_seconds": number(view_of.prepare_seconds), "compile_seconds": number(view_of.compile_seconds),
+        "budget_seconds": budget,
+    }  # fmt: skip
+    return views, timing
+
+
+def camera_at(path, index):
+    """One camera of a path."""
+    return jax.tree.map(lambda leaf: leaf[index], path.cameras)
+
+
+def _within(model, video, path, budget):
+    """A `Renderer` at the largest scale whose frames fit the budget, and its size factors (u, v); else the smallest."""
+    for scale in SCALES:
+        smaller = scaled_video(video, scale)
+        height, width = (new / old for new, old in zip(smaller.images.shape[1:3], video.images.shape[1:3], strict=True))
+        view_of, factors = Renderer(model, smaller), (width, height)
+        if budget is None:
+            break
+        _, seconds = view_of(resized(camera_at(path, 0), *factors), int(path.times[0]))
+        if seconds * len(path.times) + view_of.prepare_seconds <= budget:
+            break
+    return view_of, factors
+
+
+def scaled_video(video, scale):
+    """A video resized by area, its cameras with it."""
+    if scale == 1:
+        return video
+    have = video.images.shape[1:3]
+    size = tuple(max(1, round(side * scale)) for side in have)
+    images = np.stack([resize_area(np.asarray(image), *size) for image in video.images])
+    cameras = resized(video.cameras, size[1] / have[1], size[0] / have[0])
+    return video._replace(images=images, cameras=jax.tree.map(np.asarray, cameras))

@@ -1,0 +1,65 @@
+"""metrics.json as a line and as a table for people."""
+
+import json
+from pathlib import Path
+
+from zestjax.apps.scoring import REGIONS, better_floor, mean_scores, share_of_the_way
+from zestjax.io.files import write_bytes
+
+HEAD = (
+    "| scene | full PSNR / SSIM | dynamic | static | nearest | plane warp | ceiling | above the better floor "
+    "(full / dynamic / static) | of the way | depth | flow px | s / frame |"
+)
+
+
+def headline(report):
+    """PSNR by region against the better floor, and the seconds: one line."""
+    mean = report["mean"]
+    parts = []
+    for region in REGIONS:
+        floor = better_floor(report["floors"], region)
+        if mean.get(region) and floor is not None:
+            parts.append(
+                f"{region} {mean[region]['psnr']:.2f} dB ({mean[region]['psnr'] - floor:+.2f} on the better floor)"
+            )
+    return f"{report['scene']}: {', '.join(parts)}, {mean['seconds_per_frame']:.2f} s a frame"
+
+
+def write_table(out, reports):
+    """Write `table.md` and `metrics.json`, the mean of the reports; returns that mean."""
+    shared = {key: reports[0][key] for key in ("system", "protocol", "height", "width", "preset", "device", "weights")}
+    means = {key: mean_scores([report[key] for report in reports]) for key in ("mean", "floors", "ceiling")}
+    whole = {"scene": "mean", **shared, **means, "targets": [_placed(t, r) for r in reports for t in r["targets"]]}
+    table = [HEAD, "|---" * HEAD.count(" | ") + "|---|", *(table_row(report) for report in [*reports, whole])]
+    write_bytes(Path(out) / "table.md", ("\n".join(table) + "\n").encode())
+    write_bytes(Path(out) / "metrics.json", (json.dumps(whole, indent=1) + "\n").encode())
+    return whole
+
+
+def _placed(target, report):
+    """A target's row, with its scene and its file seen from the folder above."""
+    file = None if target["file"] is None else f"{report['scene']}/{target['file']}"
+    return {"scene": report["scene"], **target, "file": file}
+
+
+def table_row(report):
+    """A scene's row."""
+    mean, floors, ceiling = report["mean"], report["floors"], report["ceiling"]
+    psnrs = lambda scores: " / ".join(_shown(scores[r]["psnr"] if scores and scores.get(r) else None) for r in REGIONS)
+    gains = []
+    for region in REGIONS:
+        floor = better_floor(floors, region)
+        known = mean.get(region) and floor is not None
+        gains.append(f"{mean[region]['psnr'] - floor:+.2f}" if known else "–")
+    pairs = [f"{mean[r]['psnr']:.2f} / {_shown(mean[r]['ssim'], 3)}" if mean.get(r) else "–" for r in REGIONS]
+    share = share_of_the_way(mean, floors, ceiling)
+    cells = [
+        report["scene"], *pairs, psnrs(floors["nearest_frame"]), psnrs(floors["plane_warp"]), psnrs(ceiling),
+        " / ".join(gains), "–" if share is None else f"{100 * share:.0f} %", _shown(mean["depth_abs_rel"], 3),
+        _shown(mean["flow_epe_px"]), _shown(mean["seconds_per_frame"]),
+    ]  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def _shown(value, digits=2):
+    return "–" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,80 @@
+"""Weights together with the configuration they belong to: the file carries both."""
+
+import dataclasses
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from zestjax import learn
+from zestjax.io.weights import WeightsError, load_weights, read_metadata
+from zestjax.presets import Config
+
+SYSTEMS = {
+    "zest": {},
+    "zest-geometry": {"motion": False},
+    "zest-motion": {"geometry": False},
+    "zest-none": {"geometry": False, "motion": False},
+}
+"""What each system changes in a preset."""
+
+
+class Model(NamedTuple):
+    """params: learned arrays. config: `presets.Config`. system: str. path: the file. metadata: dict of the run."""
+
+    params: Any
+    config: Config
+    system: str
+    path: Path
+    metadata: dict
+
+
+def shipped_weights():
+    """The file of the weights that come with the package."""
+    return Path(str(resources.files("zestjax") / "weights" / "small.safetensors"))
+
+
+def config_from_json(fields):
+    """A `Config` from its dict in a file.
+
+    Raises:
+      WeightsError: fields that this version does not know.
+    """
+    known = {field.name for field in dataclasses.fields(Config)}
+    if unknown := sorted(fields.keys() - known):
+        raise WeightsError(f"the configuration has fields that this version does not know: {', '.join(unknown)}")
+    return Config(**{name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()})
+
+
+def system_of(config):
+    """The name of the system that a configuration is."""
+    volumes = (config.geometry, config.motion)
+    return next(name for name, c in SYSTEMS.items() if (c.get("geometry", True), c.get("motion", True)) == volumes)
+
+
+def open_weights(path=None, *, system=None):
+    """Load weights and their configuration.
+
+    Args:
+      path: file; None: the shipped ones.
+      system: refuse weights of another system.
+
+    Returns:
+      `Model`.
+
+    Raises:
+      WeightsError: no such file, damaged, of another system or of a newer version.
+    """
+    path = Path(path) if path is not None else shipped_weights()
+    metadata = read_metadata(path)
+    try:
+        config = config_from_json(metadata["config"])
+    except (KeyError, TypeError, WeightsError) as error:
+        raise WeightsError(f"{path}: has no configuration this version can use ({error}); use its version.") from error
+    found = system_of(config)
+    if system is not None and system != found:
+        raise WeightsError(f"{path}: holds weights of `{found}`, not `{system}`; train them with --system {system}.")
+    like = jax.eval_shape(lambda: learn.init_params(jax.random.key(0), config))
+    params, _ = load_weights(path, like)
+    return Model(params, config, found, path, metadata)
