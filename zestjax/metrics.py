@@ -8,6 +8,7 @@ NaN, which a report writes as null.
     C        channels, 3 for RGB
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -86,8 +87,8 @@ def ssim_map(image, truth):
         )
     zero = jnp.zeros_like(image)
     moments = (image, truth, zero, zero, zero)
-    for axis in (1, 0):
-        moments = _window_moments(moments, axis)
+    for _ in ("rows", "columns"):
+        moments = [jnp.swapaxes(moment, 0, 1) for moment in _window_moments(*moments)]
     mean_a, mean_b, variance_a, variance_b, covariance = moments
     c1, c2 = 0.01**2, 0.03**2
     luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
@@ -111,7 +112,7 @@ def depth_abs_rel(depth, truth, mask):
     check_shapes("depth_abs_rel", depth=(depth, "H W"), truth=(truth, "H W"))
     known = jnp.isfinite(truth) & (truth > 0)
     relative = jnp.abs(depth - jnp.where(known, truth, 1)) / jnp.where(known, truth, 1)
-    mask = known if mask is None else known * jnp.asarray(mask, depth.dtype)
+    mask = known if mask is None else jnp.where(known, jnp.asarray(mask, depth.dtype), 0)
     return _mean_where(relative, mask, where="depth_abs_rel")
 
 
@@ -132,40 +133,43 @@ def endpoint_error(flow, truth, mask):
     check_shapes("endpoint_error", flow=(flow, "H W 2"), truth=(truth, "H W 2"))
     known = jnp.all(jnp.isfinite(truth), axis=-1)
     error = jnp.linalg.norm(flow - jnp.where(known[..., None], truth, 0), axis=-1)
-    mask = known if mask is None else known * jnp.asarray(mask, flow.dtype)
+    mask = known if mask is None else jnp.where(known, jnp.asarray(mask, flow.dtype), 0)
     return _mean_where(error, mask, where="endpoint_error")
 
 
-def _window_moments(moments, axis):
-    """Means, variances and covariance of a window from those of its parts along one axis (law of total variance)."""
+def _window_moments(*moments):
+    """Moments of a window along the rows from those of its parts, each (H, W, C): the law of total variance."""
     offsets = np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1)
     taps = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
-    taps = [float(tap) for tap in taps / taps.sum()]
-    parts = [_shifts(moment, axis) for moment in moments]
-    mean_a = sum(tap * part for tap, part in zip(taps, parts[0], strict=True))
-    mean_b = sum(tap * part for tap, part in zip(taps, parts[1], strict=True))
-    variance_a = variance_b = covariance = 0.0
-    for tap, a, b, within_a, within_b, within_ab in zip(taps, *parts, strict=True):
-        variance_a = variance_a + tap * (within_a + (a - mean_a) ** 2)
-        variance_b = variance_b + tap * (within_b + (b - mean_b) ** 2)
-        covariance = covariance + tap * (within_ab + (a - mean_a) * (b - mean_b))
-    return mean_a, mean_b, variance_a, variance_b, covariance
+    height, dtype = moments[0].shape[0], moments[0].dtype
+    mirrored = [jnp.pad(moment, ((SSIM_RADIUS,) * 2, (0, 0), (0, 0)), mode="symmetric") for moment in moments]
 
+    def average(parts_of):
+        """Mean over the window of what `parts_of` makes of the moments that many rows on."""
 
-def _shifts(x, axis):
-    """The 11 translates of x (H, W, C) along an axis, mirrored at the border (the edge pixel is repeated)."""
-    padding = [(SSIM_RADIUS, SSIM_RADIUS) if i == axis else (0, 0) for i in range(x.ndim)]
-    padded, size = jnp.pad(x, padding, mode="symmetric"), x.shape[axis]
-    take = lambda start: padded[start : start + size] if axis == 0 else padded[:, start : start + size]
-    return [take(start) for start in range(2 * SSIM_RADIUS + 1)]
+        def add(total, entry):
+            rows, tap = entry
+            shifted = [jax.lax.dynamic_slice_in_dim(moment, rows, height) for moment in mirrored]
+            return tuple(t + tap * part for t, part in zip(total, parts_of(*shifted), strict=True)), None
+
+        zeros = tuple(jnp.zeros_like(part) for part in parts_of(*moments))
+        return jax.lax.scan(add, zeros, (jnp.arange(len(taps)), jnp.asarray(taps / taps.sum(), dtype)))[0]
+
+    mean_a, mean_b = average(lambda a, b, *_: (a, b))
+    spread = lambda a, b, va, vb, c: (va + (a - mean_a) ** 2, vb + (b - mean_b) ** 2, c + (a - mean_a) * (b - mean_b))
+    return mean_a, mean_b, *average(spread)
 
 
 def _mean_where(x, mask, *, where):
     """Mean of x (H, W) under the mask, None for all; NaN when it is empty. x may be non-finite outside the mask."""
     if mask is None:
-        return jnp.mean(x)
+        return _mean(x)
     check_shapes(where, image=(x, "H W"), mask=(mask, "H W"))
     mask = jnp.asarray(mask, x.dtype)
-    count = jnp.sum(mask)
-    total = jnp.sum(jnp.where(mask > 0, x, 0) * mask)
-    return jnp.where(count > 0, total / jnp.where(count > 0, count, 1), jnp.nan)
+    share = _mean(mask)
+    return jnp.where(share > 0, _mean(jnp.where(mask > 0, x, 0) * mask) / jnp.where(share > 0, share, 1), jnp.nan)
+
+
+def _mean(x):
+    """Mean of (H, W), row by row: one float32 sum over an image is off in the fifth digit."""
+    return jnp.mean(jnp.mean(x, axis=-1))
