@@ -71,12 +71,14 @@ def shot(scene, camera, time, key, *, height, width, samples=2):
     return Shot(image, frame.depth, motion_mask(scene, frame, time), still, flow.astype(jnp.float16))
 
 
-def _noiseless(scene):
+def without_noise(scene):
+    """The scene with the sensor's noise at 0, in the same program."""
     noise = scene.effects.noise
     return scene._replace(effects=scene.effects._replace(noise=None if noise is None else jnp.zeros_like(noise)))
 
 
-def _camera(cameras, index):
+def take_camera(cameras, index):
+    """One `Camera` of a batch."""
     return Camera(*(jnp.asarray(leaf[index]) for leaf in cameras))
 
 
@@ -84,7 +86,7 @@ def shots(scene, cameras, times, key, *, height, width):
     """`Shot` of host arrays with a leading axis: each camera at its time. All are dispatched before any is awaited."""
     keys = jax.random.split(key, len(times))
     taken = [
-        shot(scene, _camera(cameras, i), jnp.asarray(time, jnp.float32), keys[i], height=height, width=width)
+        shot(scene, take_camera(cameras, i), jnp.asarray(time, jnp.float32), keys[i], height=height, width=width)
         for i, time in enumerate(times)
     ]
     return jax.tree.map(lambda *rows: np.stack([np.asarray(row) for row in rows]), *taken)
@@ -100,7 +102,7 @@ def clip(drawn, key, *, height, width, slack=(0.0, 0.0)):
     scene = jax.tree.map(jnp.asarray, drawn.scene)
     size = dict(height=height, width=width)
     video = shots(scene, drawn.cameras, range(len(drawn.cameras.intrinsics)), key, **size)
-    clean = _noiseless(scene)
+    clean = without_noise(scene)
     truth = shots(clean, drawn.targets, drawn.target_times, key, **size)
     static = shots(jax.jit(without_movers)(clean), drawn.targets, drawn.target_times, key, **size)
     depths = [video.depth, truth.depth, static.depth]

@@ -6,9 +6,13 @@
     unit body  the box [-1, 1]^3 or the ball of radius 1
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
+import numpy as np
+
+from zestjax.cameras import Camera
 
 
 class Motion(NamedTuple):
@@ -104,3 +108,27 @@ class Frame(NamedTuple):
     depth: jax.Array
     body: jax.Array
     point: jax.Array
+
+
+@dataclass(frozen=True)
+class SimulatedScene:
+    """A scene with its cameras.
+
+    name: of the scene. scene: `Scene`. rig: (C,) `Camera`, every camera there is. taken: (N,) int, the camera that
+    took each frame. near, far: depth bounds that hold for every camera at every time. height, width: of the images
+    the rig's intrinsics are for.
+    """
+
+    name: str
+    scene: Scene
+    rig: Camera
+    taken: np.ndarray
+    near: float
+    far: float
+    height: int
+    width: int
+
+    @property
+    def frames(self):
+        """N."""
+        return len(self.taken)
