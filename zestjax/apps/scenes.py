@@ -1,0 +1,89 @@
+"""A scene by the name a user gives it: a folder in any supported layout, or `bench:NAME` of zest-bench."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from zestjax.cameras import Camera
+from zestjax.checks import check_option
+from zestjax.io.scenes import PROTOCOLS, Scene, Target, load_scene
+
+BENCH_SIZE = (144, 256)
+
+
+class Opened(NamedTuple):
+    """scene: `Scene`. ceiling: function of a `Target` to `simulate.ceiling.Ceiling`, of simulated scenes; else None."""
+
+    scene: Scene
+    ceiling: Callable | None
+
+
+def open_scene(name, config, *, size=None, protocol="held-out", targets=None, layout=None):
+    """Open a scene.
+
+    Args:
+      name: folder, or `bench:NAME`.
+      config: `Config`, whose height is the default of a folder's pictures; zest-bench is 144 x 256 by default.
+      size: (height, width), or None.
+      protocol: `held-out`, `strict` or `paper`; None where no target is wanted.
+      targets: times to predict, or None for all. Of zest-bench all means every time, by one held-out camera each.
+      layout: of the folder, recognised unless told.
+
+    Returns:
+      `Opened`.
+
+    Raises:
+      ValueError: no such scene, protocol or target.
+    """
+    name = str(name)
+    if name.startswith("bench:"):
+        check_option("open_scene", protocol=(protocol, (*PROTOCOLS, None)))
+        return _open_bench(name.removeprefix("bench:"), size or BENCH_SIZE, protocol, targets)
+    height, width = size or (config.height, None)
+    scene = load_scene(
+        name, height=height, width=width, layout=layout, protocol=protocol or "strict", targets=targets
+    )  # fmt: skip
+    return Opened(scene, None)
+
+
+def _open_bench(name, size, protocol, targets):
+    from zestjax.simulate.bench import bench_scene
+    from zestjax.simulate.ceiling import ceiling
+    from zestjax.simulate.footage import answers, input_video
+
+    simulated = bench_scene(name, height=size[0], width=size[1])
+    video = jax.tree.map(np.asarray, input_video(simulated))
+    if protocol is None:
+        return Opened(Scene(name, video, (), layout="bench"), None)
+    times = range(simulated.frames) if targets is None else targets
+    if outside := [time for time in times if not 0 <= time < simulated.frames]:
+        raise ValueError(f"bench:{name}: no target {outside[0]}; its times are 0 to {simulated.frames - 1}.")
+    cameras = [held_out_camera(simulated, t) if protocol == "held-out" else int(simulated.taken[t]) for t in times]
+    shown = answers(simulated, list(times), cameras)
+    listed = [target_from_answers(shown, i, cameras[i], protocol) for i in range(len(times))]
+    limit = lambda target: ceiling(simulated, video, target.camera, target.time, exclude=target.exclude)
+    return Opened(Scene(name, video, listed, layout="bench"), limit)
+
+
+def held_out_camera(simulated, time):
+    """The rig's camera that a time is judged by: another than the frame's own, all distances to it in turn."""
+    count = len(simulated.rig.intrinsics)
+    return (int(simulated.taken[time]) + 1 + 5 * time % (count - 1)) % count
+
+
+def target_from_answers(shown, i, camera, protocol):
+    """The i-th of `Answers` as a `Target`; its flow is towards the next input frame, NaN where that does not see it."""
+    time = int(shown.times[i])
+    known = shown.visible[i, 0]
+    return Target(
+        time=time,
+        camera_name="input" if protocol != "held-out" else f"cam{camera:02d}",
+        camera=Camera(*(np.asarray(leaf)[i] for leaf in shown.cameras)),
+        image=shown.images[i],
+        dynamic=shown.moving[i],
+        exclude=(time,) if protocol == "strict" else (),
+        depth=shown.depth[i],
+        flow=np.where(known[..., None], shown.flow[i, 0], np.nan),
+    )
