@@ -52,7 +52,7 @@ def frame(video, i):
 
 
 def test_the_nearest_frame_is_nearest_in_time_and_then_in_position(video):
-    index = lambda camera, time, exclude=(): int(floors.nearest_frame(video, camera, time, exclude=exclude).index)
+    index = lambda camera, time, exclude=(): int(floors.nearest_frame(video, camera, time, exclude=exclude).frame)
     assert index(camera_at(-5.0), 3) == 3
     assert index(camera_at(-5.0), 3, (3,)) == 2
     assert index(camera_at(5.0), 3, (3,)) == 4
@@ -62,7 +62,7 @@ def test_the_nearest_frame_is_nearest_in_time_and_then_in_position(video):
 
 def test_the_nearest_frame_is_returned_unchanged_under_jit(video):
     nearest = jax.jit(floors.nearest_frame)(video, camera_at(1.0), jnp.int32(2), exclude=jnp.array([2]))
-    assert int(nearest.index) == 3
+    assert int(nearest.frame) == 3
     np.testing.assert_array_equal(nearest.image, video.images[3])
 
 

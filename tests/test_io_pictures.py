@@ -1,5 +1,7 @@
 """Pictures and videos: exact where the format is, readable by others, and clear about what cannot be written."""
 
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false, reportCallIssue=false
+
 import os
 
 import cv2

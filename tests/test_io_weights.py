@@ -1,5 +1,7 @@
 """Weights and checkpoints: the same bits back, one clear error otherwise, and never half a file."""
 
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false, reportCallIssue=false
+
 import errno
 import json
 import os

@@ -29,11 +29,11 @@ class Nearest(NamedTuple):
     """The nearest frame.
 
     image: (H, W, 3) that frame, unchanged.
-    index: () int32, which one it is.
+    frame: () int32, which one it is.
     """
 
     image: jax.Array
-    index: jax.Array
+    frame: jax.Array
 
 
 class PlaneWarped(NamedTuple):

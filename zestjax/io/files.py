@@ -15,9 +15,15 @@ def write_bytes(path, content):
     """Write a file atomically; its folder is made when missing.
 
     Raises:
-      OSError: the disk is full or the place not writable; what was there is unchanged.
+      OSError: the disk is full or the place not writable; it names the path and the remedy, and what was there is
+        unchanged.
     """
     path = Path(path)
+    with _explained(path):
+        _write(path, content)
+
+
+def _write(path, content):
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
     try:
@@ -50,22 +56,36 @@ def replaced_folder(path, *, marker):
         raise ValueError(
             f"{path}: holds files that are not an earlier result of this; choose an empty or a new folder."
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
+    with _explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
     try:
         fresh, old = temporary / "new", temporary / "old"
         fresh.mkdir()
-        yield fresh
-        if path.exists():
-            path.rename(old)
-        try:
-            fresh.rename(path)
-        except OSError:
-            if old.exists():
-                old.rename(path)
-            raise
+        with _explained(path):
+            yield fresh
+            if path.exists():
+                path.rename(old)
+            try:
+                fresh.rename(path)
+            except OSError:
+                if old.exists():
+                    old.rename(path)
+                raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _explained(path):
+    """Context: an OSError leaves it once more, saying what to do; one that already does is left alone."""
+    remedy = "free some space or choose another place; nothing was changed there"
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or remedy in str(error.strerror):
+            raise
+        raise OSError(error.errno, f"{error.strerror}; {remedy}", str(path)) from error
 
 
 def _umask():

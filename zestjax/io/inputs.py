@@ -41,7 +41,7 @@ def check_target(where, video, camera):
       ValueError: naming the camera's position.
     """
     height, width = video.images.shape[1:3]
-    camera = Camera(*(np.asarray(leaf) for leaf in camera))
+    camera = Camera._make(map(np.asarray, camera))
     if not _shares_view(camera, video.cameras, video, height, width):
         raise ValueError(
             f"{where}: the target camera (pose {np.asarray(camera.camera_from_world)[:3].round(3).tolist()}) sees "

@@ -85,4 +85,4 @@ def pictures_in(folder):
 
 def select(cameras, index):
     """The camera, or cameras, at an index of the leading axis."""
-    return Camera(*(np.asarray(leaf)[index] for leaf in cameras))
+    return Camera._make(np.asarray(leaf)[index] for leaf in cameras)

@@ -55,7 +55,7 @@ def read_nrnerf(path):
         name=path.resolve().name,
         layout="nrnerf",
         images=tuple(images[index] for index in kept),
-        cameras=Camera(*(np.asarray(leaf) for leaf in cameras)),
+        cameras=Camera._make(map(np.asarray, cameras)),
         size=(round(height), round(width)),
         near=near,
         far=far,

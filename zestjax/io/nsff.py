@@ -47,14 +47,14 @@ def read_nsff(path):
         raise ValueError(f"{source}: is not a numpy file ({error}); copy or write it again.") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
         raise ValueError(f"{source}: should hold finite (N, 17) poses and bounds, got {rows.shape}; write it again.")
-    if len(rows) != len(images):
+    if not images or len(rows) != len(images):
         raise ValueError(
-            f"{source}: has {len(rows)} poses for {len(images)} pictures in {images[0].parent}; remove the extra ones."
+            f"{source}: has {len(rows)} poses for {len(images)} pictures; complete it, or remove the extra ones."
         )
     poses = rows[:, :15].reshape(-1, 3, 5)
     if not np.allclose(poses[:, :2, 4], poses[0, :2, 4]):
         raise ValueError(f"{source}: frames of several sizes are not one video; resize them to one.")
-    cameras = Camera(*(np.asarray(leaf) for leaf in camera_from_llff_pose(poses.astype(np.float32))))
+    cameras = Camera._make(map(np.asarray, camera_from_llff_pose(poses.astype(np.float32))))
     about = json.loads((root / "scene.json").read_text()) if (root / "scene.json").is_file() else {}
     near, far = (about["near"], about["far"]) if "near" in about else bounds_from_frames(rows[:, 15:])
     scene = path.resolve().parent if path.resolve().name == "dense" else path.resolve()

@@ -52,12 +52,9 @@ def write_image(path, picture):
       OSError: the disk is full or the place not writable; nothing half-written is left.
     """
     path, pixels = Path(path), to_bytes(picture)
-    try:
-        done, content = cv2.imencode(path.suffix, pixels[..., ::-1] if pixels.ndim == 3 else pixels)
-    except cv2.error:
-        done = False
-    if not done:
+    if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"{path}: cannot write pictures as `{path.suffix}`; use one of {', '.join(SUFFIXES)}.")
+    _, content = cv2.imencode(path.suffix, pixels[..., ::-1] if pixels.ndim == 3 else pixels)
     write_bytes(path, content.tobytes())
 
 

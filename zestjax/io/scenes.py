@@ -120,7 +120,7 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
     size = _size(image_size(record.images[0]), height, width)
     images = np.stack([resize_area(read_image(file), *size) for file in record.images])
     cameras = _resized(record.cameras, record.size, size)
-    video = Video(images, cameras, np.float32(record.near), np.float32(record.far))
+    video = Video._make((images, cameras, np.float32(record.near), np.float32(record.far)))
     check_inputs(str(path), video)
     masks = _stack(record.motion_masks, len(images), lambda file: resize_nearest(read_mask(file), *size))
     listed = _other_views(record, size) if protocol == "held-out" else _own_views(record, video, masks, protocol)
@@ -131,7 +131,7 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
         motion_masks=masks,
         flow_forward=_flow(record.flow_forward, len(images), size),
         flow_backward=_flow(record.flow_backward, len(images), size),
-        disparity=_stack(record.disparity, len(images), lambda file: resize_nearest(_arrays(file), *size)),
+        disparity=_stack(record.disparity, len(images), lambda file: resize_nearest(_load(file), *size)),
         layout=record.layout,
     )
 
@@ -162,8 +162,8 @@ def _size(have, height, width):
 
 def _resized(cameras, have, size):
     """The cameras of pictures of `size`, from those of pictures of size `have`, both (height, width)."""
-    cameras = Camera(*(np.asarray(leaf, np.float32) for leaf in cameras))
-    return Camera(*(np.asarray(leaf) for leaf in resized(cameras, size[1] / have[1], size[0] / have[0])))
+    cameras = Camera._make(np.asarray(leaf, np.float32) for leaf in cameras)
+    return Camera._make(map(np.asarray, resized(cameras, size[1] / have[1], size[0] / have[0])))
 
 
 def _own_views(record, video, masks, protocol):
@@ -252,13 +252,17 @@ def _stack(files, count, read):
 
 
 def _arrays(path):
-    """The arrays of an npz, or the one array of an npy file.
+    """The arrays of an npz file, by name."""
+    return _load(path, dict)
+
+
+def _load(path, of=np.asarray):
+    """What a numpy file holds, read by `of`.
 
     Raises:
       ValueError: the file is missing or damaged.
     """
     try:
-        content = np.load(path, allow_pickle=False)
-        return content if isinstance(content, np.ndarray) else dict(content)
+        return of(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: is not a numpy file that can be read ({error}); copy or write it again.") from error

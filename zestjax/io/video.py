@@ -76,7 +76,7 @@ def read_video(path):
 def _encode_webm(path, bgr, fps):
     height, width = bgr.shape[1:3]
     with _silenced_stderr():
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"VP80"), fps, (width, height))
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), fps, (width, height))
     if not writer.isOpened():
         return False
     for frame in bgr:

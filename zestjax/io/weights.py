@@ -51,10 +51,7 @@ def save_weights(path, params, *, metadata):
     try:
         write_bytes(path, safetensors.numpy.save(arrays, metadata=header))
     except OSError as error:
-        raise WeightsError(
-            f"{path}: could not be written ({error.strerror or error}); free some space or choose another place. "
-            "Nothing was changed there."
-        ) from error
+        raise WeightsError(f"{path}: could not be written: {error.strerror or error}.") from error
 
 
 def load_weights(path, like=None):
@@ -102,7 +99,7 @@ def _named_leaves(tree):
 
 
 def _is_key(leaf):
-    return hasattr(leaf, "dtype") and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _to_numpy(leaf):
