@@ -1,24 +1,30 @@
-"""3-D convolutions of kernel size 3, in the forms that are fast where XLA's own are not.
+"""3-D convolutions of kernel size 3, in a form that is fast where XLA's own is not.
 
-XLA's 3-D convolution, and above all its gradient, is tens of times slower on a CPU than the same sums written as 2-D
-convolutions or matrix products; on a GPU it is cuDNN's and wins. Hence a `lowering`: same numbers, different program.
+XLA's 3-D convolution, and above all its gradient, is tens of times slower on a CPU than the same sums as one 2-D
+convolution with the kernel's depth folded into the channels; on a GPU XLA's is cuDNN's and wins. Hence a `lowering`:
+same numbers, different program.
 
 Vocabulary:
-  tap: one of the 27 offsets of the kernel; depth tap: one of its three planes.
-  parity: whether an output index of a transposed convolution is even or odd, on each axis.
+  tap: one of the 27 offsets of the kernel.
+  fine, coarse: the larger and the smaller volume of a convolution of stride 2; of stride 1: its input and its output.
+  columns: what each tap reads of the fine volume, side by side as channels.
 """
+
+import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from zestjax.checks import check_option, check_shapes
 
 VOLUMES = ("NDHWC", "DHWIO", "NDHWC")
 IMAGES = ("NHWC", "HWIO", "NHWC")
-TAPS = [(i, j, k) for i in range(3) for j in range(3) for k in range(3)]
-LOWERINGS = ("auto", "plain", "taps", "col2im")
-TRANSPOSE_LOWERINGS = ("auto", "plain", "phases")
+LOWERINGS = ("auto", "plain", "folded")
+# PARITY[s, p, i] is 1 where tap i takes input j + s to output 2 j + p of a transposed convolution, on one axis.
+PARITY = np.zeros((2, 2, 3))
+PARITY[0, 0, 1] = PARITY[0, 1, 2] = PARITY[1, 1, 0] = 1
 
 
 def conv3d(x, kernel, *, stride=1, lowering="auto"):
@@ -28,22 +34,16 @@ def conv3d(x, kernel, *, stride=1, lowering="auto"):
       x: (D, H, W, in).
       kernel: (3, 3, 3, in, out).
       stride: 1 or 2, on all axes; output cell j sits on input cell `stride` j.
-      lowering: "plain" (XLA's), "taps" (three 2-D convolutions, one for each depth tap), "col2im" (a product to 27 out
-        columns a plane, then shifted adds: for many channels in and few out; stride 1), or "auto": "plain" on an
-        accelerator, on a CPU the faster of the others for these channels.
+      lowering: "plain" (XLA's), "folded" (2-D convolutions, own gradients), or "auto": "folded" on a CPU, else "plain".
 
     Raises:
-      ValueError: if shapes do not fit, or the lowering is unknown or cannot have this stride.
+      ValueError: if shapes do not fit, or an option is unknown.
     """
-    sizes = check_shapes("conv3d", kernel=(kernel, "3 3 3 in out"), x=(x, "D H W in"))
-    check_option("conv3d", lowering=(lowering, LOWERINGS), stride=(stride, (1, 2)))
-    if lowering == "auto":
-        few_out = stride == 1 and sizes["out"] <= 8 and sizes["in"] >= 24
-        lowering = "plain" if jax.default_backend() != "cpu" else "col2im" if few_out else "taps"
-    if lowering == "col2im":
-        check_option('conv3d with lowering="col2im"', stride=(stride, (1,)))
-        return _conv_col2im(x, kernel)
-    return (_conv_plain if lowering == "plain" else _conv_taps)(x, kernel, stride)
+    check_shapes("conv3d", kernel=(kernel, "3 3 3 in out"), x=(x, "D H W in"))
+    check_option("conv3d", stride=(stride, (1, 2)))
+    if _lowering("conv3d", lowering) == "folded":
+        return _conv(x, kernel, stride)
+    return lax.conv_general_dilated(x[None], kernel, (stride,) * 3, [(1, 1)] * 3, dimension_numbers=VOLUMES)[0]
 
 
 def conv3d_transpose(x, kernel, *, lowering="auto"):
@@ -55,97 +55,110 @@ def conv3d_transpose(x, kernel, *, lowering="auto"):
     Args:
       x: (D, H, W, in).
       kernel: (3, 3, 3, in, out).
-      lowering: "plain" (XLA's, zero-stuffed input), "phases" (each of the eight output parities from its own
-        taps, no zeros), or "auto": "plain" on an accelerator, "phases" on a CPU.
+      lowering: "plain" (XLA's, zero-stuffed input), "folded" (a 2-D convolution to the eight output parities, own
+        gradients), or "auto": "folded" on a CPU, else "plain".
 
     Raises:
       ValueError: if shapes do not fit, or the lowering is unknown.
     """
     check_shapes("conv3d_transpose", kernel=(kernel, "3 3 3 in out"), x=(x, "D H W in"))
-    check_option("conv3d_transpose", lowering=(lowering, TRANSPOSE_LOWERINGS))
-    if lowering == "auto":
-        lowering = "phases" if jax.default_backend() == "cpu" else "plain"
-    return (_transpose_plain if lowering == "plain" else _transpose_phases)(x, kernel)
+    if _lowering("conv3d_transpose", lowering) == "folded":
+        return _conv_transpose(x, kernel)
+    x, kernel, padding = x[None], kernel[::-1, ::-1, ::-1], [(1, 2)] * 3
+    return lax.conv_general_dilated(x, kernel, (1,) * 3, padding, (2,) * 3, dimension_numbers=VOLUMES)[0]
 
 
-def _conv_plain(x, kernel, stride):
-    return lax.conv_general_dilated(x[None], kernel, (stride,) * 3, [(1, 1)] * 3, dimension_numbers=VOLUMES)[0]
+def _lowering(where, lowering):
+    check_option(where, lowering=(lowering, LOWERINGS))
+    return ("folded" if jax.default_backend() == "cpu" else "plain") if lowering == "auto" else lowering
 
 
-def _conv_taps(x, kernel, stride):
-    last = (x.shape[0] - 1) // stride * stride
-    x = jnp.pad(x, [(1, 1), (0, 0), (0, 0), (0, 0)])
-    planes = [lax.slice_in_dim(x, i, i + last + 1, stride) for i in range(3)]
-    convolve = lambda plane, tap: lax.conv_general_dilated(
-        plane, tap, (stride, stride), [(1, 1)] * 2, dimension_numbers=IMAGES
-    )
-    return sum(convolve(plane, tap) for plane, tap in zip(planes[1:], kernel[1:], strict=True)) + convolve(
-        planes[0], kernel[0]
-    )
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _conv(x, kernel, stride):
+    return _gather(x, kernel, stride)
+
+
+def _conv_bwd(stride, saved, d_out):
+    x, kernel = saved
+    if stride == 1:
+        d_x = _gather(d_out, _reverse(kernel), 1)
+    else:
+        d_x = _spread(d_out, kernel.swapaxes(3, 4))[: x.shape[0], : x.shape[1], : x.shape[2]]
+    return d_x, _kernel_gradient(x, d_out, stride)
+
+
+_conv.defvjp(lambda x, kernel, stride: (_gather(x, kernel, stride), (x, kernel)), _conv_bwd)
 
 
 @jax.custom_vjp
-def _conv_col2im(x, kernel):
-    depth, h, w, n_in = x.shape
-    n_out = kernel.shape[-1]
-    columns_kernel = kernel.transpose(3, 0, 1, 2, 4).reshape(n_in, 27 * n_out)
-
-    def plane(ring, x_plane):
-        """Output planes get their last share from the input plane after them; `ring` holds the two unfinished ones."""
-        columns = (x_plane.reshape(-1, n_in) @ columns_kernel).reshape(h, w, 3, 3, 3, n_out)
-        columns = jnp.pad(columns, [(1, 1), (1, 1)] + [(0, 0)] * 4)
-        shares = [sum(columns[j : j + h, k : k + w, i, j, k] for j in range(3) for k in range(3)) for i in range(3)]
-        return (ring[1] + shares[1], shares[0]), ring[0] + shares[2]
-
-    zero = jnp.zeros((h, w, n_out), x.dtype)
-    ring, out = lax.scan(plane, (zero, zero), x)
-    return jnp.concatenate([out[1:], ring[0][None]])
+def _conv_transpose(x, kernel):
+    return _spread(x, kernel)
 
 
-def _conv_col2im_bwd(saved, d_out):
-    """Both gradients of a plane from one gather of the output's: every tap's reading of it, side by side."""
+def _conv_transpose_bwd(saved, d_out):
     x, kernel = saved
-    depth, h, w, n_in = x.shape
-    n_out = kernel.shape[-1]
-    kernel_columns = kernel.transpose(0, 1, 2, 4, 3).reshape(27 * n_out, n_in)
-    d_out = jnp.pad(d_out, [(1, 1), (1, 1), (1, 1), (0, 0)])
-
-    def plane(d_kernel, inputs):
-        x_plane, z = inputs
-        near = lax.dynamic_slice_in_dim(d_out, z, 3)
-        columns = jnp.concatenate([near[2 - i, 2 - j : 2 - j + h, 2 - k : 2 - k + w] for i, j, k in TAPS], axis=-1)
-        columns = columns.reshape(-1, 27 * n_out)
-        return d_kernel + x_plane.reshape(-1, n_in).T @ columns, (columns @ kernel_columns).reshape(h, w, n_in)
-
-    d_kernel, d_x = lax.scan(plane, jnp.zeros((n_in, 27 * n_out), x.dtype), (x, jnp.arange(depth)))
-    return d_x, d_kernel.reshape(n_in, 3, 3, 3, n_out).transpose(1, 2, 3, 0, 4)
+    return _gather(d_out, kernel.swapaxes(3, 4), 2), _kernel_gradient(d_out, x, 2).swapaxes(3, 4)
 
 
-_conv_col2im.defvjp(lambda x, kernel: (_conv_col2im(x, kernel), (x, kernel)), _conv_col2im_bwd)
+_conv_transpose.defvjp(lambda x, kernel: (_spread(x, kernel), (x, kernel)), _conv_transpose_bwd)
 
 
-def _transpose_plain(x, kernel):
-    flipped = kernel[::-1, ::-1, ::-1]
-    return lax.conv_general_dilated(
-        x[None], flipped, (1,) * 3, [(1, 2)] * 3, lhs_dilation=(2,) * 3, dimension_numbers=VOLUMES
-    )[0]
+def _reverse(kernel):
+    """The kernel that takes an output's gradient back to the input of a convolution of stride 1."""
+    return kernel[::-1, ::-1, ::-1].swapaxes(3, 4)
 
 
-def _transpose_phases(x, kernel):
-    """On an axis, output 2 j takes x[j] kernel[1], output 2 j + 1 takes x[j] kernel[2] + x[j + 1] kernel[0]."""
-    depth, h, w, _ = x.shape
-    x = jnp.pad(x, [(0, 1), (0, 1), (0, 1), (0, 0)])
-    reads = (((0, 1),), ((0, 2), (1, 0)))  # by parity: (shift of the input, tap)
-    phases = [
-        sum(
-            x[s : s + depth, t : t + h, u : u + w] @ kernel[i, j, k]
-            for s, i in reads[a]
-            for t, j in reads[b]
-            for u, k in reads[c]
-        )
-        for a in (0, 1)
-        for b in (0, 1)
-        for c in (0, 1)
-    ]
-    out = jnp.stack(phases).reshape(2, 2, 2, depth, h, w, -1)
-    return out.transpose(3, 0, 4, 1, 5, 2, 6).reshape(2 * depth, 2 * h, 2 * w, -1)
+def _gather(fine, kernel, stride):
+    """Coarse volume of a fine one: one 2-D convolution, the kernel's depth among its channels in, or out if fewer."""
+    n_in, n_out = kernel.shape[3:]
+    planes = (fine.shape[0] - 1) // stride * stride + 1
+    depth = lambda x, i: lax.slice_in_dim(x, i, i + planes, stride)
+    convolve = lambda x, kernel: lax.conv_general_dilated(
+        x, kernel, (stride, stride), [(1, 1)] * 2, dimension_numbers=IMAGES
+    )
+    ends = [(1, 1), (0, 0), (0, 0), (0, 0)]
+    if n_in <= n_out or stride == 2:
+        fine = jnp.pad(fine, ends)
+        taps = jnp.concatenate([depth(fine, i) for i in range(3)], axis=-1)
+        return convolve(taps, kernel.transpose(1, 2, 0, 3, 4).reshape(3, 3, 3 * n_in, n_out))
+    shares = convolve(fine, kernel.transpose(1, 2, 3, 0, 4).reshape(3, 3, n_in, 3 * n_out))
+    shares = jnp.pad(shares, ends)
+    first, *rest = (depth(shares[..., i * n_out : (i + 1) * n_out], i) for i in range(3))
+    return sum(rest, first)
+
+
+def _spread(coarse, kernel):
+    """Fine volume of a coarse one, stride 2: all eight output parities from one 2-D convolution, then interleaved."""
+    depth, h, w, n_in = coarse.shape
+    parity = jnp.asarray(PARITY, kernel.dtype)
+    kernel = jnp.einsum("sai,tbj,uck,ijkmn->tusmabcn", parity, parity, parity, kernel)
+    following = jnp.pad(coarse[1:], [(0, 1), (0, 0), (0, 0), (0, 0)])
+    fine = lax.conv_general_dilated(
+        jnp.concatenate([coarse, following], axis=-1),
+        kernel.reshape(2, 2, 2 * n_in, -1),
+        (1, 1),
+        [(0, 1)] * 2,
+        dimension_numbers=IMAGES,
+    )
+    fine = fine.reshape(depth, h, w, 2, 2, 2, -1).transpose(0, 3, 1, 4, 2, 5, 6)
+    return fine.reshape(2 * depth, 2 * h, 2 * w, -1)
+
+
+def _kernel_gradient(fine, coarse, stride):
+    """Columns of the fine volume, transposed, times the coarse one, plane by plane: (3, 3, 3, n_fine, n_coarse)."""
+    n_fine, n_coarse = fine.shape[-1], coarse.shape[-1]
+    if stride == 1 and n_coarse < n_fine:  # fewer columns
+        return _reverse(_kernel_gradient(coarse, fine, 1))
+    h, w = (stride * (n - 1) + 1 for n in coarse.shape[1:3])
+    fine = jnp.pad(fine, [(1, 1), (1, 1), (1, 1), (0, 0)])
+
+    def plane(total, inputs):
+        z, coarse = inputs
+        near = lax.dynamic_slice_in_dim(fine, stride * z, 3)
+        taps = [near[i, j : j + h : stride, k : k + w : stride] for i, j, k in np.ndindex(3, 3, 3)]
+        columns = jnp.concatenate(taps, axis=-1).reshape(-1, 27 * n_fine)
+        return total + columns.T @ coarse.reshape(-1, n_coarse), None
+
+    zero = jnp.zeros((27 * n_fine, n_coarse), fine.dtype)
+    total, _ = lax.scan(plane, zero, (jnp.arange(coarse.shape[0]), coarse))
+    return total.reshape(3, 3, 3, n_fine, n_coarse)

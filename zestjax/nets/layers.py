@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from zestjax.checks import check_shapes
-
-SPACES = ("NHWC", "HWIO", "NHWC")
+from zestjax.checks import check_option, check_shapes
+from zestjax.nets.conv2d import convolve2d
 
 
 class Dense(NamedTuple):
@@ -125,14 +124,14 @@ def conv2d(params, x, *, stride=1):
       stride: 1 or 2.
 
     Raises:
-      ValueError: if the channels of x are not what the kernel takes.
+      ValueError: if the channels of x are not what the kernel takes, or on another stride.
     """
     check_shapes("conv2d", kernel=(params.kernel, "size size in out"), x=(x, "B H W in"))
-    if params.kernel.shape[0] == 1 and stride == 1:
-        out = x @ params.kernel[0, 0]
+    check_option("conv2d", stride=(stride, (1, 2)))
+    if params.kernel.shape[0] == 1:
+        out = x[:, ::stride, ::stride] @ params.kernel[0, 0]
     else:
-        pad = params.kernel.shape[0] // 2
-        out = lax.conv_general_dilated(x, params.kernel, (stride,) * 2, [(pad, pad)] * 2, dimension_numbers=SPACES)
+        out = convolve2d(x, params.kernel, stride)
     return out if params.bias is None else add_bias(out, params.bias)
 
 

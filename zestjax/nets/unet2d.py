@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from zestjax.checks import check_shapes
-from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d
+from zestjax.nets.conv2d import doubled_convolve2d
+from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d, norm_act
 
 
 class UNet2d(NamedTuple):
@@ -60,6 +60,6 @@ def unet2d(params, x):
         skips.append(x)
         x = block2d(follow, block2d(halve, x, stride=2, instance=True), instance=True)
     for block, skip in zip(params.ups[::-1], skips[::-1], strict=True):
-        x = jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)[:, : skip.shape[1], : skip.shape[2]]
-        x = block2d(block, x, instance=True) + skip
+        x = doubled_convolve2d(x, block.conv.kernel)[:, : skip.shape[1], : skip.shape[2]]
+        x = norm_act(block.norm, x, instance=True) + skip
     return conv2d(params.head, x)
