@@ -137,7 +137,8 @@ def look_at(position, target, *, up):
     """Pose of a camera at `position` that sees `target` in its centre, upright.
 
     Args:
-      position, target: (..., 3) world, not the same point.
+      position: (..., 3) world.
+      target: (..., 3) world, another point than `position`.
       up: (..., 3) world direction that points up in the image; any length but 0. Where it is parallel to the viewing
         direction another is chosen in its place.
 
@@ -164,7 +165,8 @@ def camera_from_opengl_pose(pose, height, width, focal):
 
     Args:
       pose: (..., 3, 4) or (..., 4, 4) world_from_camera.
-      height, width: of the image, pixels.
+      height: rows of the image.
+      width: columns of the image.
       focal: pixels, a number or (focal_u, focal_v).
 
     Returns:

@@ -24,8 +24,8 @@ def cost_volume(tables, homographies, grid, *, trust=None, depths=None, floor=1e
 
     mean = sum_v w_v f_v / sum_v w_v,   variance = sum_v w_v (f_v - mean)^2 / sum_v w_v
 
-    A point of plane d at reference pixel p lies at depth d (H p)_3 in the source (see `planesweep.plane_homography`); that
-    depth is what a `Trust` tests.
+    A point of plane d at reference pixel p lies at depth d (H p)_3 in the source (see `planesweep.plane_homography`):
+    that depth is what a `Trust` tests.
 
     Args:
       tables: (V, Hs, Ws, C).
@@ -45,7 +45,8 @@ def cost_volume(tables, homographies, grid, *, trust=None, depths=None, floor=1e
       ValueError: on a wrong shape, or `trust` without `depths`.
 
     Source: ZeST-NeRF sec. 3.1 and MVSNeRF (Chen et al. 2021) sec. 3.1.
-    Differs from the reference: masked and centred (Welford), so never negative; `mvsnerf_cost_volume` is the published form.
+    Differs from the reference: masked and centred (Welford), so never negative; `mvsnerf_cost_volume` is the published
+    form.
     """
     sizes = check_shapes(
         "cost_volume", tables=(tables, "V Hs Ws C"), homographies=(homographies, "D V 3 3"), grid=(grid, "h w 3")
@@ -80,10 +81,12 @@ def cost_volume(tables, homographies, grid, *, trust=None, depths=None, floor=1e
 def sweep_colours(images, homographies, grid):
     """Every view's colours on every plane, side by side: the colour half of the paper's volume.
 
-    Where features are swept at the same resolution, `cost_volume(..., per_view=3)` returns the same from the same gathers.
+    Where features are swept at the same resolution, `cost_volume(..., per_view=3)` returns them from the same gathers.
 
     Args:
-      images: (V, Hs, Ws, C). homographies: (D, V, 3, 3). grid: (h, w, 3).
+      images: (V, Hs, Ws, C).
+      homographies: (D, V, 3, 3) to the images' pixels.
+      grid: (h, w, 3).
 
     Returns:
       (D, h, w, V C), views in order, 0 where a view does not see.
@@ -109,9 +112,9 @@ def mvsnerf_cost_volume(features, colours, homographies, *, padding=0, colour_vi
     """The cost volume that MVSNeRF's published weights were trained with, faults included.
 
     Channels: the reference's colours (not warped, 0 in the padding), the other views' warped colours, then
-    (sum_v f^2) / n - ((sum_v f) / n)^2 with n the number of views that see. The sums are not masked: samples up to a pixel
-    outside a view contribute but are not counted, the reference counts everywhere, points behind a camera count as well,
-    and the difference can be strongly negative.
+    (sum_v f^2) / n - ((sum_v f) / n)^2 with n the number of views that see. The sums are not masked: samples up to a
+    pixel outside a view contribute but are not counted, the reference counts everywhere, points behind a camera count
+    as well, and the difference can be strongly negative.
 
     Args:
       features: (V, h, w, C), view 0 the reference.

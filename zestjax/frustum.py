@@ -78,8 +78,8 @@ def world_from_frustum(frustum, coords, *, spacing="depth"):
     Raises:
       ValueError: on a wrong shape or an unknown spacing.
 
-    Differs from the reference: ZeST-NeRF's losses invert with NSFF's OpenGL [-1, 1] cube, which is not the map that made
-    its coordinates.
+    Differs from the reference: ZeST-NeRF's losses invert with NSFF's OpenGL [-1, 1] cube, which is not the map that
+    made its coordinates.
     """
     check_shapes("world_from_frustum", coords=(coords, "... 3"))
     check_option("world_from_frustum", spacing=(spacing, SPACINGS))

@@ -7,7 +7,7 @@
     grid          (h, w, 3) homogeneous reference pixels
     corners       the 4 table rows around each cell, (b, h, w, C') each
 
-A view's rows are gathered once for all their channels: one flat table, four gathers. The gradient follows the closed form
+A view's rows are gathered once for all their channels: one flat table, four gathers. The gradient is the closed form
 
     d/df_v = weight_v / count * (d/dmean + 2 d/dvariance (f_v - mean))
 
@@ -100,7 +100,7 @@ def _block(sweep, flat, homographies, depth, grid):
 
 
 def _stream(sweep, flat, homographies, depths, grid):
-    """flat (V, rows, C), homographies (D / b, b, V, 3, 3), depths (D / b, b) -> `CostVolume` with leading (D / b, b)."""
+    """`plane_statistics` as JAX would differentiate it."""
     return lax.map(lambda block: _block(sweep, flat, *block, grid), (homographies, depths))
 
 

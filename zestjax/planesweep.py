@@ -42,7 +42,8 @@ def plane_homography(reference, source, depth):
     Reference: ZeST-NeRF utils.py `homo_warp`.
 
     Args:
-      reference, source: one `Camera` each, no batch axes.
+      reference: one `Camera`, no batch axes.
+      source: one `Camera`, no batch axes.
       depth: () world units, > 0.
 
     Returns:

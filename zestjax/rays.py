@@ -65,7 +65,9 @@ def depths_from_fractions(fractions, near, far, *, spacing="depth"):
     """Fractions in [0, 1], any shape, to depths from near (at 0) to far (at 1).
 
     Args:
-      fractions: (...); near, far: scalars, world units, 0 < near < far.
+      fractions: (...).
+      near: scalar, world units, > 0.
+      far: scalar, > near.
       spacing: `depth` or `inverse`.
 
     Raises:
@@ -95,8 +97,10 @@ def stratified_depths(key, near, far, count, rays, *, spacing="depth"):
 
     Args:
       key: random key.
-      near, far: scalars, world units, 0 < near < far.
-      count: samples on a ray. rays: how many rays.
+      near: scalar, world units, > 0.
+      far: scalar, > near.
+      count: samples on a ray.
+      rays: how many rays.
       spacing: `depth` or `inverse`: what the strata are equal in.
 
     Returns:
@@ -106,8 +110,8 @@ def stratified_depths(key, near, far, count, rays, *, spacing="depth"):
       ValueError: on an unknown spacing.
 
     Source: NeRF (Mildenhall et al. 2020), eq. 2.
-    Differs from the reference: ZeST-NeRF's strata end at the midpoints of the regular depths, its two outer ones are half
-    as wide as the others and so sampled twice as densely; these are equal.
+    Differs from the reference: ZeST-NeRF's strata end at the midpoints of the regular depths, so its two outer ones
+    are half as wide as the others and sampled twice as densely; these are equal.
     """
     dtype = jnp.result_type(near, far, jnp.float32)
     jitter = jax.random.uniform(key, (rays, count), dtype)
@@ -120,7 +124,8 @@ def interval_lengths(depths, near, far):
 
     Args:
       depths: (..., S) ascending, in [near, far].
-      near, far: scalars.
+      near: scalar, where the first interval begins.
+      far: scalar, where the last one ends.
 
     Returns:
       (..., S), >= 0, finite; they sum to far - near. In depth: times the direction's norm they are world lengths.
@@ -148,7 +153,8 @@ def sample_pixels(key, mask, count):
       ValueError: if `mask` is not (H, W).
     """
     width = check_shapes("sample_pixels", mask=(mask, "H W"))["W"]
-    running = jnp.cumsum((mask > 0).reshape(-1), dtype=jnp.int32)
+    chosen = mask if mask.dtype == bool else mask > 0
+    running = jnp.cumsum(chosen.reshape(-1), dtype=jnp.int32)
     available = running[-1]
     rank = jax.random.randint(key, (count,), 0, jnp.maximum(available, 1))
     index = jnp.searchsorted(running, rank + 1).astype(jnp.int32)

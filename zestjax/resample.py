@@ -41,7 +41,7 @@ class Cells(NamedTuple):
 
 
 def corner_offsets(*shape):
-    """Offsets in the flat table from a cell's first corner to all its corners, last axis fastest; an axis of 1 has none."""
+    """Table offsets from a cell's first corner to all its corners, last axis fastest; an axis of 1 has one corner."""
     offsets, stride = (0,), 1
     for size in reversed(shape):
         step = stride if size > 1 else 0
@@ -78,12 +78,12 @@ def gather_corners(table, first, offsets):
 
 
 def interpolate(corners, across, down):
-    """Blend a cell's four corners (..., C) by the fractions (...): three linear interpolations."""
+    """Blend a cell's four corners (..., C) by the fractions (...); exact where these are 0 or 1."""
     across, down = across[..., None], down[..., None]
     upper_left, upper_right, lower_left, lower_right = corners
-    upper = upper_left + (upper_right - upper_left) * across
-    lower = lower_left + (lower_right - lower_left) * across
-    return upper + (lower - upper) * down
+    upper = upper_left * (1 - across) + upper_right * across
+    lower = lower_left * (1 - across) + lower_right * across
+    return upper * (1 - down) + lower * down
 
 
 def bilinear(image, pixels, *, border="zero"):
@@ -144,5 +144,6 @@ def trilinear(volume, cells, *, border="clamp"):
     first = (plane * height + row) * width + column
     corners = gather_corners(volume.reshape(-1, sizes["C"]), first, corner_offsets(*shape))
     near, far = interpolate(corners[:4], across, down), interpolate(corners[4:], across, down)
-    values = near + (far - near) * along[..., None]
+    along = along[..., None]
+    values = near * (1 - along) + far * along
     return jnp.where(inside[..., None], values, 0) if border == "zero" else values

@@ -17,7 +17,8 @@ from zestjax.cameras import project
 from zestjax.checks import check_shapes
 from zestjax.resample import bilinear
 
-FARTHEST = 10  # tolerances: beyond, exp(-x^2) is 0 in float32, and its square must not overflow
+FARTHEST = 10  # tolerances: beyond, exp(-x^2) is 0 in float32, while x^2 and d x / d tolerance may overflow
+NARROWEST = 1e-12  # 1 / world unit, the least tolerance: its square must not underflow
 
 
 class Trust(NamedTuple):
@@ -31,7 +32,7 @@ class Trust(NamedTuple):
 
 def agreement(inverse_depth, tolerance, point_inverse_depth):
     """exp(-((inverse_depth - point) / tolerance)^2), in [0, 1]: is the point on the surface that the frame shows?"""
-    gap = jnp.clip((inverse_depth - point_inverse_depth) / tolerance, -FARTHEST, FARTHEST)
+    gap = _gap(jnp.abs(inverse_depth - point_inverse_depth), tolerance)
     return jnp.exp(-gap * gap)
 
 
@@ -40,7 +41,7 @@ def behind(inverse_depth, tolerance, point_inverse_depth):
 
     1 - exp(-(relu(inverse_depth - point) / tolerance)^2).
     """
-    gap = jnp.clip((inverse_depth - point_inverse_depth) / tolerance, 0, FARTHEST)
+    gap = _gap(jax.nn.relu(inverse_depth - point_inverse_depth), tolerance)
     return -jnp.expm1(-gap * gap)
 
 
@@ -49,7 +50,8 @@ def trusted(static, inverse_depth, tolerance, point_inverse_depth):
 
     static * exp(-(relu(inverse_depth - point) / tolerance)^2); the arguments are arrays of one shape, see the header.
     """
-    return static * (1 - behind(inverse_depth, tolerance, point_inverse_depth))
+    gap = _gap(jax.nn.relu(inverse_depth - point_inverse_depth), tolerance)
+    return static * jnp.exp(-gap * gap)
 
 
 def trusted_at(trust, camera, points):
@@ -75,3 +77,10 @@ def trusted_at(trust, camera, points):
     tolerance = jnp.where(seen, maps[..., 2], 1)
     weight = trusted(maps[..., 0], maps[..., 1], tolerance, 1 / jnp.where(in_front, depth, 1))
     return jnp.where(seen, weight, 0)
+
+
+def _gap(distance, tolerance):
+    """distance / tolerance, at most 10, with a gradient that stays finite however small the tolerance."""
+    tolerance = jnp.maximum(tolerance, NARROWEST)
+    far = distance >= FARTHEST * tolerance
+    return jnp.where(far, FARTHEST, distance / jnp.where(far, 1, tolerance))

@@ -31,8 +31,8 @@ def check_video(where, video):
       video: `Video`.
 
     Raises:
-      ValueError: if shapes disagree, a colour is outside [0, 1] or not finite (bytes must be divided by 255), a camera is
-        degenerate, or the depth bounds are not 0 < near < far.
+      ValueError: if shapes disagree, a colour is outside [0, 1] or not finite (bytes must be divided by 255), a camera
+        is degenerate, or the depth bounds are not 0 < near < far.
     """
     check_shapes(
         where,

@@ -1,0 +1,61 @@
+"""Each primitive at the point where the naive form breaks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import assert_finite, assert_grads_match
+
+from zestjax import numerics
+
+
+def test_exclusive_sums_and_products_start_with_nothing():
+    x = jnp.asarray([[2.0, 3.0, 5.0], [1.0, 0.0, 4.0]])
+    np.testing.assert_array_equal(numerics.exclusive_cumsum(x), [[0, 2, 5], [0, 1, 1]])
+    np.testing.assert_array_equal(numerics.exclusive_cumprod(x), [[1, 2, 6], [1, 1, 0]])
+
+
+def test_a_huge_last_entry_does_not_absorb_the_sum_before_it():
+    np.testing.assert_array_equal(numerics.exclusive_cumsum(jnp.asarray([0.25, 0.5, 1e10])), [0, 0.25, 0.75])
+
+
+@pytest.mark.parametrize("x", [0.0, 1e-30, 1.0, 1e18])
+def test_norm_and_its_gradient_are_finite(x):
+    vector = jnp.full(3, x)
+    assert_finite(numerics.safe_norm, vector)
+    if x >= 1:
+        np.testing.assert_allclose(numerics.safe_norm(vector), np.sqrt(3) * x, rtol=1e-6)
+
+
+def test_norm_has_no_gradient_at_the_origin():
+    np.testing.assert_array_equal(jax.grad(numerics.safe_norm)(jnp.zeros(3)), 0)
+
+
+def test_division_by_zero_is_what_was_asked_for_with_no_gradient():
+    divide = lambda a, b: numerics.safe_divide(a, b, otherwise=7.0)
+    np.testing.assert_array_equal(divide(jnp.asarray([1.0, 3.0]), jnp.asarray([0.0, 2.0])), [7, 1.5])
+    assert_finite(divide, jnp.asarray([1.0, 3.0]), jnp.asarray([0.0, 2.0]))
+
+
+def test_masked_mean_of_nothing_is_zero():
+    x, empty = jnp.asarray([np.nan, np.inf]), jnp.zeros(2)
+    assert numerics.masked_mean(x, empty) == 0
+    np.testing.assert_array_equal(jax.grad(numerics.masked_mean)(jnp.ones(2), empty), 0)
+
+
+def test_masked_mean_ignores_what_is_not_finite_outside_the_mask():
+    x = jnp.asarray([1.0, np.nan, 3.0])
+    assert numerics.masked_mean(x, jnp.asarray([True, False, True])) == 2
+    assert np.isfinite(jax.grad(numerics.masked_mean)(x, jnp.asarray([1.0, 0.0, 1.0]))).all()
+
+
+def test_products_broadcast_over_leading_axes():
+    a, b = np.random.default_rng(0).normal(size=(2, 4, 3, 3)).astype("f")
+    np.testing.assert_allclose(numerics.matmul(a, b), a @ b, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(numerics.matvec(a, b[..., 0]), (a @ b)[..., 0], rtol=1e-5, atol=1e-6)
+
+
+def test_gradients_match_finite_differences(x64):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 5)))
+    assert_grads_match(lambda x: numerics.safe_norm(x) + numerics.exclusive_cumprod(x)[..., -1], x)
+    assert_grads_match(lambda x: numerics.masked_mean(x, x > 0) + numerics.exclusive_cumsum(x).sum(), x)
