@@ -111,7 +111,7 @@ def masked_median(values, mask):
       ValueError: if the last axes differ.
     """
     check_shapes("masked_median", values=(values, "... P"), mask=(mask, "... P"))
-    mask = jnp.broadcast_to(mask, values.shape) > 0
+    mask = jnp.broadcast_to(mask, values.shape).astype(bool)
     count = jnp.sum(mask, axis=-1)
     ordered = jnp.sort(jnp.where(mask, values, jnp.inf), axis=-1)
     middle = jnp.maximum(count - 1, 0) // 2
@@ -167,10 +167,13 @@ def align_least_squares(values, target, mask):
     count = jnp.sum(mask, axis=-1)
     mean = lambda x: jnp.sum(jnp.where(mask > 0, x, 0) * mask, axis=-1) / jnp.where(count > 0, count, 1)
     values_mean, target_mean = mean(values), mean(target)
-    centred = values - values_mean[..., None]
+    centred = jnp.where(mask > 0, values - values_mean[..., None], 0)
+    unit = jax.lax.stop_gradient(jnp.max(jnp.abs(centred), axis=-1))
+    varied = unit > 4 * jnp.finfo(values.dtype).eps * jnp.abs(values_mean)
+    unit = jnp.where(varied, unit, 1)
+    centred = centred / unit[..., None]
     variance, covariance = mean(centred**2), mean(centred * (target - target_mean[..., None]))
-    varied = variance > jnp.finfo(values.dtype).eps ** 2 * values_mean**2
-    scale = jnp.where(varied, covariance / jnp.where(varied, variance, 1), 0)
+    scale = jnp.where(varied, covariance / jnp.where(varied, variance, 1), 0) / unit
     return Alignment(scale=scale, shift=target_mean - scale * values_mean)
 
 

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 
 from zestjax.cameras import project
 from zestjax.checks import check_shapes
-from zestjax.numerics import safe_divide
 
 EMPTY = 1e-4  # opacity under which a ray shows too little to have an expected point
 
@@ -128,7 +127,7 @@ def expected(weights, values, *, normalise=True):
         of the world by what the ray lets through.
 
     Returns:
-      (..., C); 0 on a ray of opacity 0.
+      (..., C), exact on rays of opacity 1e-4 or more; 0 on an empty one.
 
     Raises:
       ValueError: if the sample axes differ.
@@ -137,7 +136,7 @@ def expected(weights, values, *, normalise=True):
     total = jnp.sum(weights[..., None] * values, axis=-2)
     if not normalise:
         return total
-    return safe_divide(total, jnp.broadcast_to(jnp.sum(weights, axis=-1)[..., None], total.shape))
+    return total / jnp.maximum(jnp.sum(weights, axis=-1), EMPTY)[..., None]
 
 
 def optical_flow(weights, points, flow, camera, pixels, *, normalise=True):

@@ -28,8 +28,8 @@ with warnings.catch_warnings():
 
 
 class Fit(NamedTuple):
-    """params: like the initial ones. terms: losses at the last evaluation. grad_norm: () L2 at it.
-    steps: () int. converged: () bool, grad_norm <= tol."""
+    """params: like the initial ones. terms, grad_norm (() L2): at them, or at the last batch before the last step.
+    steps: () int. converged: () bool, that the solver's own stopping measure came down to tol."""
 
     params: Any
     terms: Any
@@ -266,20 +266,21 @@ def fit_least_squares(residual, params, *args, method="levenberg_marquardt", max
         implicit_diff=False,
         unroll=False,
     )
-    if method == "levenberg_marquardt":
-        solver = jaxopt.LevenbergMarquardt(solver="qr", **options)
-    else:
-        solver = jaxopt.GaussNewton(**options)
-    flat, state = solver.run(flat)
+    with jax.numpy_dtype_promotion("standard"):  # inside, jaxopt multiplies numbers by booleans
+        if method == "levenberg_marquardt":
+            solver = jaxopt.LevenbergMarquardt(solver="qr", materialize_jac=True, **options)
+        else:
+            solver = jaxopt.GaussNewton(**options)
+        flat, state = solver.run(flat)
     at_end, pullback = jax.vjp(options["residual_fun"], flat)
-    norm = tree_norm(pullback(at_end)[0])
-    return Fit(unravel(flat), at_end, norm, state.iter_num, norm <= tol)
+    return Fit(unravel(flat), at_end, tree_norm(pullback(at_end)[0]), state.iter_num, state.error <= tol)
 
 
 def _run(solver, params, batch, tol):
     """A jaxopt solver run on one batch, as a `Fit`."""
     params, state = solver.run(params, batch)
-    return Fit(params, state.aux, state.error, state.iter_num, state.error <= tol)
+    grads, terms = jax.grad(solver.fun, has_aux=True)(params, batch)
+    return Fit(params, terms, tree_norm(grads), state.iter_num, state.error <= tol)
 
 
 def _pass(solver, params, batches, tol):

@@ -83,9 +83,8 @@ def spectral_norm(kernel, *, iterations=8):
     held = jax.lax.stop_gradient(matrix)
     unit = lambda x: safe_divide(x, jnp.sqrt(jnp.sum(x * x)))
     right = unit(1 + jnp.arange(matrix.shape[1]).astype(matrix.dtype) / matrix.shape[1])
-    for _ in range(iterations):
-        left = unit(held @ right)
-        right = unit(held.T @ left)
+    right = jax.lax.fori_loop(0, iterations, lambda _, x: unit(held.T @ (held @ x)), right)
+    left = unit(held @ right)
     return jnp.maximum(left @ (matrix @ right), jnp.finfo(kernel.dtype).eps)
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from zestjax.checks import check_option
 from zestjax.numerics import masked_mean
 
-NORMS = ("absolute", "squared")
+NORMS = {"absolute": jnp.abs, "squared": jnp.square}
 NORMALISERS = ("count", "confidence")
 
 
@@ -44,24 +44,17 @@ def spread_mask(where, name, mask, shape):
     return mask.reshape(mask.shape + (1,) * missing)
 
 
-def residual_norm(where, residual, norm):
-    """|residual| or residual^2, elementwise.
+def mean_over_valid(where, residual, *, norm=None, valid=None, confidence=None, normalise="count"):
+    """Mean of confidence * norm(residual) over what is valid; exactly 0, with a 0 gradient, when nothing is.
 
-    Raises:
-      ValueError: if `norm` is neither "absolute" nor "squared".
-    """
-    check_option(where, norm=(norm, NORMS))
-    return jnp.abs(residual) if norm == "absolute" else residual**2
-
-
-def mean_over_valid(where, cost, *, valid=None, confidence=None, normalise="count"):
-    """Mean of confidence * cost over what is valid; exactly 0, with a 0 gradient, when nothing is.
+    What is not valid may hold NaN or infinity: neither the value nor the gradient sees it.
 
     Args:
       where: name of the calling loss, for messages.
-      cost: the residual's norm, any shape.
-      valid: leading axes of `cost`, or None.
-      confidence: leading axes of `cost`, or None.
+      residual: any shape.
+      norm: "absolute", "squared", or None for a residual that is a cost already.
+      valid: leading axes of `residual`, or None.
+      confidence: leading axes of `residual`, or None.
       normalise: "count" divides by the number of valid entries; "confidence" by the sum of confidences
         (the released code's), so that the gradient reaches the confidence through both.
 
@@ -69,13 +62,18 @@ def mean_over_valid(where, cost, *, valid=None, confidence=None, normalise="coun
       () scalar.
 
     Raises:
-      ValueError: if a mask's shape does not fit or `normalise` is unknown.
+      ValueError: if a mask's shape does not fit, or `norm` or `normalise` is unknown.
     """
     check_option(where, normalise=(normalise, NORMALISERS))
-    mask = spread_mask(where, "valid", valid, cost.shape).astype(cost.dtype)
+    if norm is not None:
+        check_option(where, norm=(norm, tuple(NORMS)))
+    mask = spread_mask(where, "valid", valid, residual.shape).astype(residual.dtype)
+    cost = jnp.where(mask > 0, residual, 0)
+    cost = NORMS[norm](cost) if norm else cost
     if confidence is None:
         return masked_mean(cost, mask)
-    confidence = spread_mask(where, "confidence", confidence, cost.shape).astype(cost.dtype)
+    confidence = spread_mask(where, "confidence", confidence, residual.shape).astype(residual.dtype)
+    confidence = jnp.where(mask > 0, confidence, 0)
     if normalise == "confidence":
         return masked_mean(cost, mask * confidence)
-    return masked_mean(jnp.where(mask > 0, cost, 0) * confidence, mask)
+    return masked_mean(cost * confidence, mask)

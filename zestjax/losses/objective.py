@@ -17,7 +17,8 @@ class Terms(NamedTuple):
     there and back), min (flow magnitude), sp (flow smooth in space), temp (flow smooth in time), geo (optical
     flow prior), depth (depth prior).
     From a simulator's exact answers: depth_ce (cross-entropy over the volumes' planes), static_rec (render of the
-    static field alone), mask (dynamicness against the motion mask), flow3d (scene flow).
+    static field alone), frame_ce and frame_mask (each input frame's own depth and moving pixels), mask (dynamicness
+    against the motion mask), flow3d (scene flow).
     Other systems': distortion (weights lie together), edge (edge-aware disparity), adv (a discriminator's verdict).
     """
 
@@ -33,6 +34,8 @@ class Terms(NamedTuple):
     depth: Any = None
     depth_ce: Any = None
     static_rec: Any = None
+    frame_ce: Any = None
+    frame_mask: Any = None
     mask: Any = None
     flow3d: Any = None
     distortion: Any = None

@@ -8,7 +8,7 @@ M           neighbouring times that the scene is warped from
 import jax.numpy as jnp
 
 from zestjax.checks import check_shapes
-from zestjax.losses.means import mean_over_valid, residual_norm
+from zestjax.losses.means import mean_over_valid
 
 
 def reconstruction_loss(colour, target, *, valid=None, norm="squared"):
@@ -30,8 +30,7 @@ def reconstruction_loss(colour, target, *, valid=None, norm="squared"):
       ValueError: if the shapes differ.
     """
     check_shapes("reconstruction_loss", colour=(colour, "... 3"), target=(target, "... 3"))
-    cost = residual_norm("reconstruction_loss", colour - target, norm)
-    return mean_over_valid("reconstruction_loss", cost, valid=valid)
+    return mean_over_valid("reconstruction_loss", colour - target, norm=norm, valid=valid)
 
 
 def photometric_loss(warped, target, confidence, *, valid=None, normalise="count"):
@@ -54,5 +53,6 @@ def photometric_loss(warped, target, confidence, *, valid=None, normalise="count
       ValueError: if the shapes do not fit.
     """
     check_shapes("photometric_loss", warped=(warped, "... 3"), target=(target, "... 3"))
-    cost = (warped - jnp.broadcast_to(target, warped.shape)) ** 2
-    return mean_over_valid("photometric_loss", cost, valid=valid, confidence=confidence, normalise=normalise)
+    residual = warped - jnp.broadcast_to(target, warped.shape)
+    options = dict(norm="squared", valid=valid, confidence=confidence, normalise=normalise)
+    return mean_over_valid("photometric_loss", residual, **options)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from zestjax.checks import check_shapes
 from zestjax.depth import FLAT, whitened
-from zestjax.losses.means import mean_over_valid, residual_norm
+from zestjax.losses.means import mean_over_valid
 
 
 def geometric_loss(pixels, target_pixels, *, valid=None):
@@ -30,7 +30,7 @@ def geometric_loss(pixels, target_pixels, *, valid=None):
       ValueError: if the shapes do not fit.
     """
     check_shapes("geometric_loss", pixels=(pixels, "... 2"), target_pixels=(target_pixels, "... 2"))
-    return mean_over_valid("geometric_loss", jnp.abs(pixels - target_pixels), valid=valid)
+    return mean_over_valid("geometric_loss", pixels - target_pixels, norm="absolute", valid=valid)
 
 
 def depth_loss(depth, target, *, valid=None, norm="absolute", floor=FLAT):
@@ -56,5 +56,5 @@ def depth_loss(depth, target, *, valid=None, norm="absolute", floor=FLAT):
     check_shapes("depth_loss", depth=(depth, "... P"), target=(target, "... P"))
     mask = jnp.ones_like(depth) if valid is None else jnp.broadcast_to(valid, depth.shape).astype(depth.dtype)
     ours, theirs = whitened(depth, mask, floor=floor), whitened(target, mask, floor=floor)
-    cost = residual_norm("depth_loss", ours.values - theirs.values, norm)
-    return mean_over_valid("depth_loss", cost, valid=mask * theirs.usable[..., None].astype(mask.dtype))
+    usable = mask * theirs.usable[..., None].astype(mask.dtype)
+    return mean_over_valid("depth_loss", ours.values - theirs.values, norm=norm, valid=usable)

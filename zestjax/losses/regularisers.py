@@ -59,7 +59,7 @@ def disocclusion_loss(confidence, *, valid=None):
     Raises:
       ValueError: if `valid` does not fit.
     """
-    return mean_over_valid("disocclusion_loss", jnp.abs(confidence - 1), valid=valid)
+    return mean_over_valid("disocclusion_loss", confidence - 1, norm="absolute", valid=valid)
 
 
 def distortion_loss(weights, edges, *, valid=None):
@@ -91,16 +91,17 @@ def distortion_loss(weights, edges, *, valid=None):
     return mean_over_valid("distortion_loss", pairs + jnp.sum(weights**2 * lengths, axis=-1) / 3, valid=valid)
 
 
-def edge_aware_depth_loss(disparity, image, *, valid=None):
+def edge_aware_depth_loss(disparity, image, *, valid=None, relative=True):
     """Disparity should be smooth where the image is: |d disparity| exp(-|d image|), both over rows and columns.
 
     Source: Monodepth2 (Godard et al. 2019), eq. 3.
-    Reference: ZeST-NeRF losses.py, the disparity smoothness.
+    Reference: ZeST-NeRF losses.py, `relative=False`.
 
     Args:
-      disparity: (..., H, W), any scale: it is divided by its mean.
+      disparity: (..., H, W).
       image: (..., H, W, C) in [0, 1].
       valid: (...) frames or patches that count.
+      relative: divide the disparity by its mean over the image, so that its scale does not matter.
 
     Returns:
       () mean over vertical neighbours plus mean over horizontal ones.
@@ -109,8 +110,8 @@ def edge_aware_depth_loss(disparity, image, *, valid=None):
       ValueError: if the shapes do not fit.
     """
     check_shapes("edge_aware_depth_loss", disparity=(disparity, "... H W"), image=(image, "... H W C"))
-    mean = jnp.mean(disparity, axis=(-2, -1), keepdims=True)
-    disparity = disparity / (jnp.abs(mean) + LEAST)
+    if relative:
+        disparity = disparity / (jnp.abs(jnp.mean(disparity, axis=(-2, -1), keepdims=True)) + LEAST)
 
     def along(axis):
         edge = jnp.mean(jnp.abs(jnp.diff(image, axis=axis - 1)), axis=-1)

@@ -11,7 +11,7 @@ Convert flows from frustum units with `flow.world_flow` first.
 import jax.numpy as jnp
 
 from zestjax.checks import check_option, check_shapes
-from zestjax.losses.means import mean_over_valid, residual_norm
+from zestjax.losses.means import mean_over_valid
 from zestjax.numerics import safe_norm
 
 
@@ -36,8 +36,8 @@ def cycle_loss(flow_there, flow_back, confidence, *, valid=None, norm="absolute"
       ValueError: if the shapes do not fit.
     """
     check_shapes("cycle_loss", flow_there=(flow_there, "... S 3"), flow_back=(flow_back, "... S 3"))
-    cost = residual_norm("cycle_loss", flow_there + flow_back, norm)
-    return mean_over_valid("cycle_loss", cost, valid=valid, confidence=confidence, normalise=normalise)
+    options = dict(norm=norm, valid=valid, confidence=confidence, normalise=normalise)
+    return mean_over_valid("cycle_loss", flow_there + flow_back, **options)
 
 
 def minimum_flow_loss(flow, *, valid=None, sum_components=False):
@@ -59,8 +59,8 @@ def minimum_flow_loss(flow, *, valid=None, sum_components=False):
       ValueError: if the shapes do not fit.
     """
     check_shapes("minimum_flow_loss", flow=(flow, "... S 3"))
-    cost = jnp.abs(jnp.sum(flow, axis=-1)) if sum_components else jnp.abs(flow)
-    return mean_over_valid("minimum_flow_loss", cost, valid=valid)
+    residual = jnp.sum(flow, axis=-1) if sum_components else flow
+    return mean_over_valid("minimum_flow_loss", residual, norm="absolute", valid=valid)
 
 
 def spatial_smoothness_loss(flow, points, *, valid=None, weighting="distance", drop_far=0.0):
@@ -89,11 +89,11 @@ def spatial_smoothness_loss(flow, points, *, valid=None, weighting="distance", d
         raise ValueError(f"spatial_smoothness_loss: axis S of `flow` is {flow.shape[-2]}, of which {kept} kept; "
                          "expected at least 2.")  # fmt: skip
     between = lambda x: x[..., 1:kept, :] - x[..., : kept - 1, :]
-    cost = jnp.abs(between(flow))
+    residual = between(flow)
     if weighting == "distance":
-        distance = safe_norm(jnp.broadcast_to(between(points), cost.shape), keepdims=True)
-        cost = jnp.exp(-2 * distance) * cost
-    return mean_over_valid("spatial_smoothness_loss", cost, valid=valid)
+        distance = safe_norm(jnp.broadcast_to(between(points), residual.shape), keepdims=True)
+        residual = jnp.exp(-2 * distance) * residual
+    return mean_over_valid("spatial_smoothness_loss", residual, norm="absolute", valid=valid)
 
 
 def temporal_loss(flow_forward, flow_backward, *, valid=None, drop_far=0.0):
@@ -117,7 +117,7 @@ def temporal_loss(flow_forward, flow_backward, *, valid=None, drop_far=0.0):
     check_shapes("temporal_loss", flow_forward=(flow_forward, "... S 3"), flow_backward=(flow_backward, "... S 3"))
     kept = _near(flow_forward.shape[-2], drop_far)
     total = (flow_forward + flow_backward)[..., :kept, :]
-    return mean_over_valid("temporal_loss", total**2, valid=valid)
+    return mean_over_valid("temporal_loss", total, norm="squared", valid=valid)
 
 
 def _near(samples, drop_far):

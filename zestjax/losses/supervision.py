@@ -7,7 +7,7 @@ valid    in [0, 1]; 0 where there is no answer
 import jax.numpy as jnp
 
 from zestjax.checks import check_shapes
-from zestjax.losses.means import mean_over_valid
+from zestjax.losses.means import mean_over_valid, spread_mask
 
 
 def depth_cross_entropy_loss(log_probability, plane, *, valid=None):
@@ -29,11 +29,13 @@ def depth_cross_entropy_loss(log_probability, plane, *, valid=None):
     planes = check_shapes("depth_cross_entropy_loss", log_probability=(log_probability, "... D"))["D"]
     inside = (plane >= 0) & (plane <= planes - 1)
     plane = jnp.where(inside, plane, 0)
-    share = jnp.maximum(1 - jnp.abs(plane[..., None] - jnp.arange(planes).astype(plane.dtype).reshape(
-        (1,) * plane.ndim + (planes,))), 0)  # fmt: skip
+    index = jnp.arange(planes).astype(plane.dtype).reshape((1,) * plane.ndim + (planes,))
+    share = jnp.maximum(1 - jnp.abs(plane[..., None] - index), 0)
     cost = -jnp.sum(share * jnp.where(share > 0, log_probability, 0), axis=-1)
-    valid = inside if valid is None else jnp.broadcast_to(valid, inside.shape) * inside.astype(cost.dtype)
-    return mean_over_valid("depth_cross_entropy_loss", cost, valid=valid)
+    inside = inside.astype(cost.dtype)
+    if valid is not None:
+        inside = inside * spread_mask("depth_cross_entropy_loss", "valid", valid, inside.shape).astype(cost.dtype)
+    return mean_over_valid("depth_cross_entropy_loss", cost, valid=inside)
 
 
 def motion_mask_loss(dynamicness, moving, *, valid=None, floor=1e-3):
@@ -73,4 +75,4 @@ def scene_flow_loss(flow, target, *, valid=None):
       ValueError: if the shapes do not fit.
     """
     check_shapes("scene_flow_loss", flow=(flow, "... 3"), target=(target, "... 3"))
-    return mean_over_valid("scene_flow_loss", jnp.abs(flow - target), valid=valid)
+    return mean_over_valid("scene_flow_loss", flow - target, norm="absolute", valid=valid)

@@ -1,0 +1,114 @@
+"""The published formulas as slow float64 loops, and the checks every numerical function gets."""
+
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+GOLDEN = Path(__file__).parents[2] / "shared" / "golden"
+
+
+def golden(name):
+    """Arrays recorded from the authors' functions, without their batch axis; skips where they are not at hand."""
+    path = GOLDEN / name
+    if not path.exists():
+        pytest.skip(f"needs {Path('shared') / 'golden' / name} beside the repository")
+    with np.load(path) as file:
+        return {key: file[key][0] if file[key].ndim > 1 and file[key].shape[0] == 1 else file[key] for key in file}
+
+
+def uniform(seed, *shape, low=0.0, high=1.0, dtype=jnp.float32):
+    """Drawn by numpy, which compiles nothing."""
+    return jnp.asarray(np.random.default_rng(seed).uniform(low, high, shape), dtype)
+
+
+def normal(seed, *shape, dtype=jnp.float32):
+    """Drawn by numpy, which compiles nothing."""
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), dtype)
+
+
+@functools.cache
+def value_and_gradients(fn, count):
+    """A compiled function, kept: values and the gradients of their sum in each of `count` arguments."""
+    total = lambda *args: sum(jnp.sum(x) for x in jax.tree.leaves(fn(*args)))
+    return jax.jit(lambda *args: (fn(*args), jax.grad(total, argnums=tuple(range(count)))(*args)))
+
+
+def assert_finite(fn, *args):
+    """Values and the gradients of their sum are finite, at and in every argument."""
+    for leaf in jax.tree.leaves(value_and_gradients(fn, len(args))(*args)):
+        assert np.isfinite(leaf).all(), leaf
+
+
+def assert_grads_match(fn, *args, step=1e-6):
+    """The gradient along a random direction agrees with a central difference; float64 arguments, `x64` fixture."""
+    assert all(x.dtype == jnp.float64 for x in jax.tree.leaves(args))
+    rng = np.random.default_rng(99)
+    draw = lambda x: jnp.asarray(rng.normal(size=x.shape))
+    direction = jax.tree.map(draw, args)
+    mix = jax.tree.map(draw, jax.eval_shape(fn, *args))
+
+    @jax.jit
+    def both(t):
+        moved = lambda t: jax.tree.map(lambda x, d: x + t * d, args, direction)
+        weigh = lambda t: sum(jax.tree.leaves(jax.tree.map(lambda w, x: jnp.sum(w * x), mix, fn(*moved(t)))))
+        return jax.value_and_grad(weigh)(t)
+
+    numeric = (both(jnp.float64(step))[0] - both(jnp.float64(-step))[0]) / (2 * step)
+    np.testing.assert_allclose(both(jnp.float64(0))[1], numeric, rtol=1e-5, atol=1e-7)
+
+
+def weights_by_loop(density, lengths):
+    """NeRF eq. 3, one sample at a time."""
+    reaching, weights = 1.0, []
+    for sigma, delta in zip(np.float64(density), np.float64(lengths), strict=True):
+        alpha = 1.0 - np.exp(-sigma * delta)
+        weights.append(reaching * alpha)
+        reaching *= 1.0 - alpha
+    return np.array(weights)
+
+
+def blend_by_loop(static_alpha, dynamic_alpha, blend):
+    """NSFF section 3.3: a sample's opacity is shared between the fields by its blend."""
+    reaching, static, dynamic = 1.0, [], []
+    for a, d, b in zip(*(np.float64(x) for x in (static_alpha, dynamic_alpha, blend)), strict=True):
+        static.append(reaching * a * (1 - b))
+        dynamic.append(reaching * d * b)
+        reaching *= (1 - a * (1 - b)) * (1 - d * b)
+    return np.array(static), np.array(dynamic)
+
+
+def density_blend_by_loop(static_density, dynamic_density, blend, lengths):
+    """ZeST-NeRF eq. 7-9, with b inside the sum."""
+    thickness, static, dynamic = 0.0, [], []
+    columns = (np.float64(x) for x in (static_density, dynamic_density, blend, lengths))
+    for s, d, b, length in zip(*columns, strict=True):
+        reaching = np.exp(-thickness)
+        static.append(reaching * (1 - b) * (1 - np.exp(-s * length)))
+        dynamic.append(reaching * b * (1 - np.exp(-d * length)))
+        thickness += (s * (1 - b) + d * b) * length
+    return np.array(static), np.array(dynamic)
+
+
+def distortion_by_loop(weights, edges):
+    """mip-NeRF 360 eq. 15, over all pairs of one ray."""
+    weights, edges = np.float64(weights), np.float64(edges)
+    middles = (edges[1:] + edges[:-1]) / 2
+    total = 0.0
+    for i, wi in enumerate(weights):
+        total += wi**2 * (edges[i + 1] - edges[i]) / 3
+        for j, wj in enumerate(weights):
+            total += wi * wj * abs(middles[i] - middles[j])
+    return total
+
+
+def adam_by_loop(gradients, start, *, rate, b1=0.9, b2=0.999, eps=1e-8):
+    """Kingma and Ba, algorithm 1, on one number."""
+    x, mean, square = float(start), 0.0, 0.0
+    for t, g in enumerate(gradients, start=1):
+        mean, square = b1 * mean + (1 - b1) * g, b2 * square + (1 - b2) * g * g
+        x -= rate * (mean / (1 - b1**t)) / (np.sqrt(square / (1 - b2**t)) + eps)
+    return x
