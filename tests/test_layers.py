@@ -13,10 +13,10 @@ LAYERS = [
     "cameras video rays resample frustum",
     "nets planesweep plane_statistics selection trust cost_volume evidence analysis encoding",
     "fields",
-    "rendering depth flow presets model",
+    "rendering depth flow presets model prediction assembly",
     "losses",
     "adam schedules solve",
-    "metrics io simulate floors testing novel_view learn training",
+    "metrics io simulate floors testing batches novel_view learn training",
     "apps cli",
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names.split()}

@@ -76,4 +76,4 @@ def test_a_finished_run_takes_no_step_and_asks_for_no_batch():
 def test_the_report_names_scalars_by_their_path_and_leaves_arrays_out():
     info = {"a": jnp.float32(1), "b": {"c": jnp.float32(2)}, "image": jnp.zeros((2, 2))}
     assert training.scalars(info) == {"a": 1.0, "b.c": 2.0}
-    assert training.scalars(jnp.float32(3)) == {"loss": 3.0}
+    assert training.scalars(jnp.float32(3)) == {"total": 3.0}

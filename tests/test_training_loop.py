@@ -26,7 +26,7 @@ def toy_step(params, opt_state, batch):
     """Gradient descent with momentum on |params - batch|^2."""
     grads = jax.tree.map(lambda p: p - batch, params)
     opt_state = jax.tree.map(lambda m, g: 0.9 * m + g, opt_state, grads)
-    return jax.tree.map(lambda p, m: p - 0.1 * m, params, opt_state), opt_state, {"loss": jnp.sum(grads["w"] ** 2)}
+    return jax.tree.map(lambda p, m: p - 0.1 * m, params, opt_state), opt_state, {"total": jnp.sum(grads["w"] ** 2)}
 
 
 def toy_state():
@@ -152,7 +152,7 @@ def test_a_full_disk_costs_no_earlier_checkpoint(tmp_path, monkeypatch, whole):
 
 def test_a_loss_that_stays_non_finite_ends_the_run(tmp_path):
     def broken(params, opt_state, batch):
-        return params, opt_state, {"loss": jnp.float32(jnp.nan)}
+        return params, opt_state, {"total": jnp.float32(jnp.nan)}
 
     with pytest.raises(FloatingPointError, match="not finite"):
         run_loop(broken, toy_state(), toy_batch, options(tmp_path, 1000), metadata=RUN)
@@ -160,7 +160,7 @@ def test_a_loss_that_stays_non_finite_ends_the_run(tmp_path):
 
 def test_the_log_holds_means_and_skips_non_finite_steps(tmp_path):
     def step(params, opt_state, batch):
-        return params, opt_state, {"loss": batch}
+        return params, opt_state, {"total": batch}
 
     losses = [1.0, float("nan"), 3.0, 5.0]
     state = TrainState({"w": jnp.zeros(1)}, {}, 0)
@@ -168,7 +168,7 @@ def test_the_log_holds_means_and_skips_non_finite_steps(tmp_path):
         step, state, lambda n: jnp.float32(losses[n]), LoopOptions(tmp_path, 4, log_steps=4, quiet=True), metadata=RUN
     )
     (line,) = [json.loads(text) for text in (tmp_path / "log.jsonl").read_text().splitlines()]
-    assert line["step"] == 4 and line["loss"] == 3.0
+    assert line["step"] == 4 and line["total"] == 3.0
 
 
 PRODUCER = """

@@ -55,7 +55,7 @@ def scalars(info):
     """A step's report, any tree of () arrays, as {leaf path: float}; other leaves are left out."""
     leaves = jax.tree_util.tree_leaves_with_path(info)
     named = ((jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves)
-    return {name or "loss": float(leaf) for name, leaf in named if np.ndim(leaf) == 0}
+    return {name or "total": float(leaf) for name, leaf in named if np.ndim(leaf) == 0}
 
 
 def training_steps(step_fn, state, batch_at, *, steps):

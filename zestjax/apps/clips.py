@@ -23,15 +23,20 @@ import numpy as np
 
 from zestjax.io.files import write_bytes
 
+EVIDENCE = "evidence_"
+"""Before the names of the evidence's arrays, which share a dict with the clip's."""
+
 
 class ClipSpec(NamedTuple):
-    """Which clips: the seed they are drawn from, rows and columns, input frames and targets of each."""
+    """Which clips: the seed they are drawn from, rows and columns, input frames and targets of each, and the depth
+    planes of the frames' evidence, which is found ahead too; 0: none."""
 
     seed: int
     height: int
     width: int
     frames: int = 16
     targets: int = 8
+    planes: int = 0
 
 
 def cache_folder():
@@ -44,9 +49,20 @@ def clip_folder(spec, *, root=None):
     name = f"{spec.height}x{spec.width}-{spec.frames}+{spec.targets}-seed{spec.seed}"
     if root is not None:
         return Path(root) / name
-    sources = sorted((Path(__file__).parents[1] / "simulate").glob("*.py"))
-    code = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
-    return cache_folder() / "clips" / f"{name}-{code}"
+    return cache_folder() / "clips" / f"{name}-{_code('simulate/*.py')}"
+
+
+def evidence_folder(folder, planes):
+    """Where the evidence of a folder's clips lies: by planes and by the code that finds it."""
+    code = _code(*(f"{name}.py" for name in ("evidence", "assembly", "batches", "selection", "planesweep", "resample")))
+    return Path(folder) / f"evidence-{planes}-{code}"
+
+
+def _code(*patterns):
+    """Eight digits that change with the source files of the package that match."""
+    package = Path(__file__).parents[1]
+    sources = [path for pattern in patterns for path in sorted(package.glob(pattern))]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
 
 
 def clip_path(folder, index):
@@ -69,10 +85,10 @@ def read_clip(path):
         raise ValueError(f"{path}: is not a readable clip ({error}); delete it, it is rendered again.") from error
 
 
-def write_clip(path, clip):
-    """Write a NamedTuple of arrays, atomically; fields that are None are left out."""
+def write_clip(path, arrays):
+    """Write arrays by name, atomically; those that are None are left out."""
     buffer = io.BytesIO()
-    np.savez(buffer, **{name: np.asarray(value) for name, value in clip._asdict().items() if value is not None})
+    np.savez(buffer, **{name: np.asarray(value) for name, value in arrays.items() if value is not None})
     write_bytes(path, buffer.getvalue())
 
 
@@ -86,13 +102,37 @@ def render_clip(spec, index):
     return training_clip(key, height=spec.height, width=spec.width, frames=spec.frames, targets=spec.targets)
 
 
+def make_clip(spec, folder, index):
+    """Render clip `index` and find its evidence, those that `folder` lacks."""
+    path, found = clip_path(folder, index), clip_path(evidence_folder(folder, spec.planes), index)
+    if not path.exists():
+        write_clip(path, render_clip(spec, index)._asdict())
+    if spec.planes and not found.exists():
+        from zestjax.batches import clip_from_arrays, prepare_clip
+        from zestjax.presets import preset
+
+        clip, key = clip_from_arrays(read_clip(path)), hole_key(spec.seed, index)
+        prepared = prepare_clip(key, clip, preset("small", planes=spec.planes))
+        evidence = {f"{EVIDENCE}{name}": array for name, array in prepared.evidence._asdict().items()}
+        write_clip(found, evidence | {"holes": np.array(prepared.holes, int)})
+
+
+def hole_key(seed, index):
+    """The key that draws which frames clip `index` lacks."""
+    import jax
+
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), index), 1)
+
+
 class Producer:
     """A process that renders the clips it is asked for; a context that ends it."""
 
     def __init__(self, spec, folder):
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
+        self.folders = (self.folder, evidence_folder(folder, spec.planes)) if spec.planes else (self.folder,)
         size, counts = f"{spec.height}x{spec.width}", ["--frames", str(spec.frames), "--targets", str(spec.targets)]
+        counts += ["--planes", str(spec.planes)]
         command = [sys.executable, "-m", "zestjax.apps.clips", "--follow", "--out", str(folder), "--size", size]
         environment = os.environ | {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1"}
         self.log = (self.folder / f"producer-{os.getpid()}.log").open("w+")
@@ -113,9 +153,13 @@ class Producer:
         self.log.close()
         Path(self.log.name).unlink(missing_ok=True)
 
+    def paths(self, index):
+        """The files of clip `index`; the last is written last."""
+        return [clip_path(folder, index) for folder in self.folders]
+
     def ask(self, indices):
         """Have these clips rendered, in this order, those that exist left out."""
-        missing = [str(index) for index in indices if not clip_path(self.folder, index).exists()]
+        missing = [str(index) for index in indices if not all(path.exists() for path in self.paths(index))]
         if missing:
             with contextlib.suppress(BrokenPipeError):  # `wait` reports what ended it
                 self.process.stdin.write(" ".join(missing) + "\n")
@@ -127,21 +171,21 @@ class Producer:
         Raises:
           RuntimeError: the producer ended, with what it said last.
         """
-        path = clip_path(self.folder, index)
-        while not path.exists():
+        paths = self.paths(index)
+        while not all(path.exists() for path in paths):
             if self.process.poll() is not None:
                 self.log.seek(0)
                 said = self.log.read().strip().splitlines()
                 raise RuntimeError(f"the process that renders clips ended: {said[-1] if said else 'no message'}")
             time.sleep(0.02)
-        return read_clip(path)
+        return {name: array for path in paths for name, array in read_clip(path).items()}
 
 
 class ClipSource:
     """Clips by index, the last `alive` of them held in memory, those ahead asked for; a context."""
 
     def __init__(self, spec, folder, *, alive, evict):
-        self.folder, self.evict, self.waited, self._asked = Path(folder), evict, 0.0, None
+        self.evict, self.waited, self._asked = evict, 0.0, None
         self.producer = Producer(spec, folder)
         self._load = functools.lru_cache(maxsize=alive)(self._read)
 
@@ -155,7 +199,8 @@ class ClipSource:
         try:
             return self.producer.wait(index)
         except ValueError:
-            clip_path(self.folder, index).unlink(missing_ok=True)
+            for path in self.producer.paths(index):
+                path.unlink(missing_ok=True)
             self.producer.ask([index])
             return self.producer.wait(index)
 
@@ -173,9 +218,10 @@ class ClipSource:
         return arrays
 
     def _remove_below(self, oldest):
-        for path in self.folder.glob("clip-*.npz"):
-            if int(path.stem.removeprefix("clip-")) < oldest:
-                path.unlink(missing_ok=True)
+        for folder in self.producer.folders:
+            for path in folder.glob("clip-*.npz"):
+                if int(path.stem.removeprefix("clip-")) < oldest:
+                    path.unlink(missing_ok=True)
 
 
 def main(arguments=None):
@@ -188,19 +234,19 @@ def main(arguments=None):
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--frames", type=int, default=ClipSpec._field_defaults["frames"])
     parser.add_argument("--targets", type=int, default=ClipSpec._field_defaults["targets"])
+    parser.add_argument("--planes", type=int, default=32, help="of the frames' evidence; 0: none")
     parser.add_argument("--count", type=int, default=64)
     parser.add_argument("--follow", action="store_true")
     options = parser.parse_args(arguments)
     os.nice(5)
     height, width = (int(side) for side in options.size.split("x"))
-    spec = ClipSpec(options.seed, height, width, options.frames, options.targets)
+    spec = ClipSpec(options.seed, height, width, options.frames, options.targets, options.planes)
     folder = Path(options.out) if options.follow else clip_folder(spec, root=options.out)
     lines = (line.split() for line in sys.stdin) if options.follow else [range(options.count)]
     for indices in lines:
         for index in map(int, indices):
-            path = clip_path(folder, index)
-            if not path.exists():
-                write_clip(path, render_clip(spec, index))
+            make_clip(spec, folder, index)
+            if not options.follow:
                 print(f"clip {index}", file=sys.stderr, flush=True)
     return 0
 

@@ -176,7 +176,7 @@ def _show(bar, recorder, clock):
     if clock.options.seconds is not None:
         left = max(0.0, clock.options.seconds - clock.seconds)
         bar.set_description(f"at most {left / 60:.0f} min left", refresh=False)
-    loss = recorder.last.get("loss")
+    loss = recorder.last.get("total")
     if loss is not None:
         bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
     bar.update(1)

@@ -14,7 +14,8 @@ BENCH_SIZE = (144, 256)
 
 
 class Opened(NamedTuple):
-    """scene: `Scene`. ceiling: function of a `Target` to `simulate.ceiling.Ceiling`, of simulated scenes; else None."""
+    """scene: `Scene`. ceiling: function of a `Target` to `simulate.ceiling.Ceiling`, of simulated scenes
+    with held-out targets; else None."""
 
     scene: Scene
     ceiling: Callable | None
@@ -63,8 +64,8 @@ def _open_bench(name, size, protocol, targets):
     cameras = [held_out_camera(simulated, t) if protocol == "held-out" else int(simulated.taken[t]) for t in times]
     shown = answers(simulated, list(times), cameras)
     listed = [target_from_answers(shown, i, cameras[i], protocol) for i in range(len(times))]
-    limit = lambda target: ceiling(simulated, video, target.camera, target.time, exclude=target.exclude)
-    return Opened(Scene(name, video, listed, layout="bench"), limit)
+    limit = lambda target: ceiling(simulated, video, target.camera, target.time)
+    return Opened(Scene(name, video, listed, layout="bench"), limit if protocol == "held-out" else None)
 
 
 def held_out_camera(simulated, time):

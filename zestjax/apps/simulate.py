@@ -42,7 +42,7 @@ def simulate(options):
     frames = answers(simulated, range(count), simulated.taken)
     bounds = np.float32(0.95 * frames.depth.min()), np.float32(1.05 * frames.depth.max())
     near, far = (simulated.near, simulated.far) if options.random is None else bounds
-    video = jax.tree.map(np.asarray, input_video(simulated, key=noise))._replace(near=near, far=far)
+    video = jax.tree.map(np.asarray, input_video(simulated, noise=noise))._replace(near=near, far=far)
 
     def targets():
         for time in progress(range(count), "simulate", quiet=options.quiet):

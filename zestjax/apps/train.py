@@ -8,12 +8,15 @@ from typing import NamedTuple
 import jax
 
 import zestjax
-from zestjax import learn
-from zestjax.apps.clips import ClipSource, ClipSpec, clip_folder
+from zestjax.apps.clips import EVIDENCE, ClipSource, ClipSpec, clip_folder, hole_key
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.weights import SYSTEMS
+from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, prepare_clip
 from zestjax.checks import check_option
+from zestjax.evidence import Evidence
 from zestjax.io.weights import load_weights
+from zestjax.learn import make_train_step
+from zestjax.model import init_params
 from zestjax.presets import preset as preset_of
 from zestjax.training import TrainState, batch_key, clip_index, clip_window
 
@@ -80,10 +83,10 @@ def train(options):
 
 def fresh(config, options):
     """A run's first `TrainState`, from the seed or from given weights, and its compiled step."""
-    params = learn.init_params(jax.random.key(options.seed), config)
+    params = init_params(jax.random.key(options.seed), config)
     if options.weights is not None:
         params, _ = load_weights(options.weights, params)
-    init, step_fn = learn.make_train_step(config, steps=options.steps)
+    init, step_fn = make_train_step(config, steps=options.steps)
     return TrainState(params, init(params), 0), step_fn
 
 
@@ -105,7 +108,7 @@ def summarise(result, out, verb):
     state = result.state
     rate = result.report.get("seconds_per_step", float("nan"))
     ended = "" if result.finished else f" (interrupted; go on with: zestjax {verb} --resume --out {out})"
-    loss = result.report.get("loss")
+    loss = result.report.get("total")
     said = "" if loss is None else f", loss {loss:.4f}"
     line = (
         f"{verb}: {state.step} steps in {result.seconds:.0f} s ({rate:.2f} s a step, "
@@ -123,7 +126,8 @@ class _SimulatedBatches:
     """Batches of the sliding window of simulated clips; a context that ends their producer."""
 
     def __init__(self, config, options):
-        spec = ClipSpec(options.seed, config.height, config.width)
+        planes = config.planes if config.encoder == "frames" else 0
+        spec = ClipSpec(options.seed, config.height, config.width, planes=planes)
         folder = clip_folder(spec, root=options.clips)
         self.config, self.seed, self.count = config, options.seed, options.clip_count
         self.window = {"window": options.window, "steps_per_clip": options.steps_per_clip, "count": self.count}
@@ -141,5 +145,16 @@ class _SimulatedBatches:
         live, soon = clip_window(step, **self.window), clip_window(step + self.ahead, **self.window)
         wanted = range(live.start, soon.stop)
         wrapped = [index if self.count is None else index % self.count for index in wanted]
-        arrays = self.source.clip(clip_index(step, seed=self.seed, **self.window), wrapped)
-        return learn.batch_from_clip(batch_key(step, seed=self.seed), learn.clip_from_arrays(arrays), self.config)
+        index = clip_index(step, seed=self.seed, **self.window)
+        arrays = self.source.clip(index, wrapped)
+        prepared = prepared_from_arrays(hole_key(self.seed, index), arrays, self.config)
+        return batch_from_clip(batch_key(step, seed=self.seed), prepared, self.config)
+
+
+def prepared_from_arrays(key, arrays, config):
+    """`PreparedClip` of a stored clip, with its evidence if that was stored too; `key` draws the holes if not."""
+    clip = clip_from_arrays(arrays)
+    if "holes" not in arrays:
+        return prepare_clip(key, clip, config)
+    evidence = Evidence(**{name: arrays[EVIDENCE + name] for name in Evidence._fields})
+    return PreparedClip(clip, evidence, tuple(int(i) for i in arrays["holes"]))

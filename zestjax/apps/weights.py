@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import jax
 
-from zestjax import learn
 from zestjax.io.weights import WeightsError, load_weights, read_metadata
+from zestjax.model import init_params
 from zestjax.presets import Config
 
 SYSTEMS = {
@@ -75,6 +75,6 @@ def open_weights(path=None, *, system=None):
     found = system_of(config)
     if system is not None and system != found:
         raise WeightsError(f"{path}: holds weights of `{found}`, not `{system}`; train them with --system {system}.")
-    like = jax.eval_shape(lambda: learn.init_params(jax.random.key(0), config))
+    like = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
     params, _ = load_weights(path, like)
     return Model(params, config, found, path, metadata)
