@@ -82,7 +82,8 @@ def nearest_hit(placed, origin, direction, *, boxes, start=1e-3):
 
     Args:
       placed: `Placed`.
-      origin: vector of () or (R); direction: vector of (R), any length: it is the unit of the ray parameter.
+      origin: vector of () or (R).
+      direction: vector of (R), of any length: it is the unit of the ray parameter.
       boxes: how many of the bodies, from the first, are boxes.
       start: hits nearer than this do not count.
 

@@ -1,8 +1,8 @@
 """Training clips: a short posed video of a random scene and views to predict, with exact answers.
 
-    N        input frames
-    T        targets
-    H W      rows and columns
+N        input frames
+T        targets
+H W      rows and columns
 """
 
 from functools import partial
@@ -15,7 +15,7 @@ import numpy as np
 from zestjax.cameras import Camera
 from zestjax.simulate.motion import all_bodies
 from zestjax.simulate.random import generator, random_scene
-from zestjax.simulate.render import render
+from zestjax.simulate.render import render, with_noise
 from zestjax.simulate.truth import motion_mask, moving_bodies, scene_flow, without_movers
 
 
@@ -62,12 +62,12 @@ class Shot(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("height", "width", "samples"))
-def shot(scene, camera, time, key, *, height, width, samples=2):
+def shot(key, scene, camera, time, *, height, width, samples=2):
     """`Shot` of a scene by one camera at a time; `key` draws the sensor's noise."""
-    frame = render(scene, camera, time, height=height, width=width, samples=samples, key=key)
+    frame = render(scene, camera, time, height=height, width=width, samples=samples)
     still = ~moving_bodies(all_bodies(scene))[jnp.maximum(frame.body, 0)]
     flow = jnp.stack([scene_flow(scene, frame, time, time + step) for step in (1, -1)])
-    image = jnp.round(frame.image * 255).astype(jnp.uint8)
+    image = jnp.round(with_noise(key, frame.image, scene.effects) * 255).astype(jnp.uint8)
     return Shot(image, frame.depth, motion_mask(scene, frame, time), still, flow.astype(jnp.float16))
 
 
@@ -82,29 +82,32 @@ def take_camera(cameras, index):
     return Camera(*(jnp.asarray(leaf[index]) for leaf in cameras))
 
 
-def shots(scene, cameras, times, key, *, height, width):
+def shots(key, scene, cameras, times, *, height, width):
     """`Shot` of host arrays with a leading axis: each camera at its time. All are dispatched before any is awaited."""
     keys = jax.random.split(key, len(times))
     taken = [
-        shot(scene, take_camera(cameras, i), jnp.asarray(time, jnp.float32), keys[i], height=height, width=width)
+        shot(keys[i], scene, take_camera(cameras, i), jnp.asarray(time, jnp.float32), height=height, width=width)
         for i, time in enumerate(times)
     ]
     return jax.tree.map(lambda *rows: np.stack([np.asarray(row) for row in rows]), *taken)
 
 
-def clip(drawn, key, *, height, width, slack=(0.0, 0.0)):
+def clip(key, drawn, *, height, width, slack=(0.0, 0.0)):
     """The `Clip` of a drawn scene.
 
     Args:
-      drawn: `RandomScene` or another tuple of its fields. key: draws the noise.
+      key: draws the noise.
+      drawn: `RandomScene`.
+      height: of all images.
+      width: of all images.
       slack: shares by which near is brought nearer and far is moved away.
     """
     scene = jax.tree.map(jnp.asarray, drawn.scene)
     size = dict(height=height, width=width)
-    video = shots(scene, drawn.cameras, range(len(drawn.cameras.intrinsics)), key, **size)
+    video = shots(key, scene, drawn.cameras, range(len(drawn.cameras.intrinsics)), **size)
     clean = without_noise(scene)
-    truth = shots(clean, drawn.targets, drawn.target_times, key, **size)
-    static = shots(jax.jit(without_movers)(clean), drawn.targets, drawn.target_times, key, **size)
+    truth = shots(key, clean, drawn.targets, drawn.target_times, **size)
+    static = shots(key, jax.jit(without_movers)(clean), drawn.targets, drawn.target_times, **size)
     depths = [video.depth, truth.depth, static.depth]
     near, far = min(d.min() for d in depths), max(d.max() for d in depths)
     return Clip(
@@ -124,7 +127,10 @@ def training_clip(key, *, height=144, width=256, frames=16, targets=8):
 
     Args:
       key: JAX random key; the clip is a function of it.
-      height, width: of all images. frames: N >= 2. targets: T.
+      height: of all images.
+      width: of all images.
+      frames: N >= 2.
+      targets: T.
 
     Returns:
       `Clip`. The bounds are the true ones with a random slack of 0-25 % each.
@@ -136,4 +142,4 @@ def training_clip(key, *, height=144, width=256, frames=16, targets=8):
         raise ValueError(f"training_clip: `frames` is {frames}, expected at least 2.")
     draw, noise, slack = jax.random.split(key, 3)
     drawn = random_scene(draw, height=height, width=width, frames=frames, targets=targets)
-    return clip(drawn, noise, height=height, width=width, slack=generator(slack).uniform(0, 0.25, 2))
+    return clip(noise, drawn, height=height, width=width, slack=generator(slack).uniform(0, 0.25, 2))

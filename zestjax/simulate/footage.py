@@ -1,8 +1,8 @@
 """Pictures of a `SimulatedScene`: its input video, and any other camera at any time with its exact answers.
 
-    N        frames
-    T        targets
-    H W      rows and columns
+N        frames
+T        targets
+H W      rows and columns
 """
 
 from functools import partial
@@ -40,12 +40,13 @@ class Answers(NamedTuple):
     times: np.ndarray
 
 
-def input_video(simulated, *, key=None):
-    """The `Video` a user would have: frame i by camera `taken[i]`, with the sensor's noise (drawn from `key`)."""
-    key = jax.random.key(0) if key is None else key
+def input_video(simulated, *, noise=None):
+    """The `Video` a user would have: frame i by camera `taken[i]`, with the sensor's noise (drawn from the JAX
+    key `noise`)."""
+    key = jax.random.key(0) if noise is None else noise
     cameras = jax.tree.map(lambda leaf: leaf[simulated.taken], simulated.rig)
     scene = jax.tree.map(jnp.asarray, simulated.scene)
-    taken = shots(scene, cameras, range(simulated.frames), key, height=simulated.height, width=simulated.width)
+    taken = shots(key, scene, cameras, range(simulated.frames), height=simulated.height, width=simulated.width)
     images = jnp.asarray(taken.image, jnp.float32) / 255
     bounds = jnp.float32(simulated.near), jnp.float32(simulated.far)
     return Video(images, jax.tree.map(jnp.asarray, cameras), *bounds)
@@ -63,11 +64,16 @@ def answers(simulated, times, cameras):
       `Answers`.
     """
     times = np.asarray(times)
-    views = cameras if isinstance(cameras, Camera) else jax.tree.map(lambda leaf: leaf[np.asarray(cameras)], simulated.rig)
+    views = (
+        cameras if isinstance(cameras, Camera) else jax.tree.map(lambda leaf: leaf[np.asarray(cameras)], simulated.rig)
+    )
     scene = without_noise(jax.tree.map(jnp.asarray, simulated.scene))
     size = dict(height=simulated.height, width=simulated.width)
-    seen = shots(scene, views, times, jax.random.key(0), **size)
-    links = [[_link(scene, simulated, take_camera(views, i), time, step, size) for step in (1, -1)] for i, time in enumerate(times)]
+    seen = shots(jax.random.key(0), scene, views, times, **size)
+    links = [
+        [_link(scene, simulated, take_camera(views, i), time, step, size) for step in (1, -1)]
+        for i, time in enumerate(times)
+    ]
     flow = np.stack([[np.asarray(link.flow) for link in row] for row in links])
     visible = np.stack([[np.asarray(link.visible) for link in row] for row in links])
     moved = np.stack([[np.asarray(link.scene_flow) for link in row] for row in links])

@@ -85,8 +85,12 @@ class Layout:
         """The `Scene`.
 
         Args:
-          atlas: packed texels. light: position. ambient: share. effects: `Effects`.
-          boxes, balls: counts to pad to with absent bodies.
+          atlas: packed texels.
+          light: position, layout units.
+          ambient: share of light from everywhere.
+          effects: `Effects`.
+          boxes: how many to pad to with absent ones.
+          balls: likewise.
           mid_time: the time at which bodies with a velocity or a spin pass their given position.
           unit: world units per layout unit.
 

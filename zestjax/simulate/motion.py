@@ -1,7 +1,7 @@
 """Where every body is at a time. The caster sees these matrices only.
 
-    B        bodies
-    joint    the rigid frame a body hangs in; a body's own stretch is not passed on to its children
+B        bodies
+joint    the rigid frame a body hangs in; a body's own stretch is not passed on to its children
 """
 
 import jax

@@ -1,7 +1,7 @@
 """What scenes are furnished with: rooms, things that stand, things that move. Host side, layout axes.
 
-    z        distance from the rig, layout units; what stands nearest is at about 1
-    reach    of a `View`: distance of the back wall
+z        distance from the rig, layout units; what stands nearest is at about 1
+reach    of a `View`: distance of the back wall
 """
 
 from typing import NamedTuple
@@ -30,66 +30,68 @@ class View(NamedTuple):
         return 2 * self.across * z
 
 
-def log_uniform(rng, low, high):
+def log_uniform(chance, low, high):
     """A number whose logarithm is uniform."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(max(high, low * 1.001)))))
+    return float(np.exp(chance.uniform(np.log(low), np.log(max(high, low * 1.001)))))
 
 
-def finish(rng, view, z, size):
+def finish(chance, view, z, size):
     """Random textures, tile length, tint and gloss of a thing of half-length `size` at distance z."""
-    tile = log_uniform(rng, 1.2 * size, max(2.4 * size, 0.8 * view.width(z)))
-    tint = rng.uniform(0.65, 1.1) * rng.uniform(0.85, 1.1, 3)
-    gloss = rng.uniform(0, 0.6) if rng.random() < 0.3 else 0.0
-    return dict(textures=(int(rng.integers(SLOTS)),), tile=tile, offset=rng.uniform(0, 2, 2), tint=tint, gloss=gloss)
+    tile = log_uniform(chance, 1.2 * size, max(2.4 * size, 0.8 * view.width(z)))
+    tint = chance.uniform(0.65, 1.1) * chance.uniform(0.85, 1.1, 3)
+    gloss = chance.uniform(0, 0.6) if chance.random() < 0.3 else 0.0
+    return dict(
+        textures=(int(chance.integers(SLOTS)),), tile=tile, offset=chance.uniform(0, 2, 2), tint=tint, gloss=gloss
+    )
 
 
-def add_room(layout, rng, view, *, half_width, ceiling, behind, **motion):
+def add_room(layout, chance, view, *, half_width, ceiling, behind, **motion):
     """The hollow box around everything, and its floor."""
     depth = (view.reach + behind) / 2
     height = (view.floor + ceiling) / 2
     middle = np.array([0, (view.floor - ceiling) / 2, view.reach - depth])
-    walls = tuple(int(i) for i in rng.choice(SLOTS, 3, replace=False))
-    look = dict(tint=rng.uniform(0.8, 1.1, 3), offset=rng.uniform(0, 2, 2))
-    tile = view.width(view.reach) * rng.uniform(0.25, 0.8)
+    walls = tuple(int(i) for i in chance.choice(SLOTS, 3, replace=False))
+    look = dict(tint=chance.uniform(0.8, 1.1, 3), offset=chance.uniform(0, 2, 2))
+    tile = view.width(view.reach) * chance.uniform(0.25, 0.8)
     layout.box(
         shape=sized((half_width, height + 0.02, depth)), position=middle, hollow=True, textures=walls, tile=tile,
         **look, **motion,
     )  # fmt: skip
-    near_tile = view.width(view.floor / view.down) * rng.uniform(0.5, 1.6)
+    near_tile = view.width(view.floor / view.down) * chance.uniform(0.5, 1.6)
     layout.box(
         shape=sized((2 * half_width, 0.5, 2 * depth)), position=(middle[0], view.floor + 0.5, middle[2]),
-        textures=(int(rng.integers(SLOTS)),), tile=near_tile, offset=rng.uniform(0, 2, 2), **motion,
+        textures=(int(chance.integers(SLOTS)),), tile=near_tile, offset=chance.uniform(0, 2, 2), **motion,
     )  # fmt: skip
 
 
-def add_standing(layout, rng, view, *, z, x, kind, motion=None):
+def add_standing(layout, chance, view, *, z, x, kind, motion=None):
     """Something still: "block", "ball", "pole", "panel", "beam", "tower" (a large block) or "hanging" (a
     ball or a block in mid-air)."""
     motion = motion or {}
     width = view.width(z)
-    turn = rng.uniform(-0.8, 0.8)
+    turn = chance.uniform(-0.8, 0.8)
     if kind == "pole":
-        half = np.array([width * rng.uniform(0.002, 0.012)] * 2)
-        height = view.floor * rng.uniform(0.6, 1.0) if rng.random() < 0.4 else view.floor + view.down * z
+        half = np.array([width * chance.uniform(0.002, 0.012)] * 2)
+        height = view.floor * chance.uniform(0.6, 1.0) if chance.random() < 0.4 else view.floor + view.down * z
         half = np.array([half[0], height / 2, half[1]])
     elif kind == "beam":
-        half = np.array([width * rng.uniform(0.15, 0.5), width * rng.uniform(0.002, 0.012), width * 0.004])
+        half = np.array([width * chance.uniform(0.15, 0.5), width * chance.uniform(0.002, 0.012), width * 0.004])
     elif kind == "panel":
-        half = np.array([width * rng.uniform(0.1, 0.3), width * rng.uniform(0.08, 0.25), width * 0.006])
+        half = np.array([width * chance.uniform(0.1, 0.3), width * chance.uniform(0.08, 0.25), width * 0.006])
     elif kind == "tower":
-        half = width * rng.uniform([0.05, 0.15, 0.03], [0.2, 0.45, 0.1])
+        half = width * chance.uniform([0.05, 0.15, 0.03], [0.2, 0.45, 0.1])
     else:
-        half = width * log_uniform(rng, 0.03, 0.15) * rng.uniform(0.6, 1.4, 3)
+        half = width * log_uniform(chance, 0.03, 0.15) * chance.uniform(0.6, 1.4, 3)
     floating = kind in ("hanging", "beam")
-    y = rng.uniform(-0.7, 0.1) * view.down * z if floating else view.floor - half[1]
-    look = finish(rng, view, z, float(half.max()))
-    add = layout.ball if kind == "ball" or (kind == "hanging" and rng.random() < 0.5) else layout.box
+    y = chance.uniform(-0.7, 0.1) * view.down * z if floating else view.floor - half[1]
+    look = finish(chance, view, z, float(half.max()))
+    add = layout.ball if kind == "ball" or (kind == "hanging" and chance.random() < 0.5) else layout.box
     add(shape=sized(half), position=(x * view.across * z, y, z), turn=turn, **look, **motion)
 
 
-def add_roller(layout, rng, view, *, z, x, size, speed, heading, gloss=None):
+def add_roller(layout, chance, view, *, z, x, size, speed, heading, gloss=None):
     """A ball that rolls over the floor; `speed` per frame along `heading` (0 is away, pi/2 is to the right)."""
-    look = finish(rng, view, z, size)
+    look = finish(chance, view, z, size)
     look |= {} if gloss is None else {"gloss": gloss}
     layout.ball(
         shape=sized((size,) * 3), position=(x * view.across * z, view.floor - size, z), turn=heading,
@@ -97,33 +99,33 @@ def add_roller(layout, rng, view, *, z, x, size, speed, heading, gloss=None):
     )  # fmt: skip
 
 
-def add_slider(layout, rng, view, *, z, x, y, size, speed, heading, spin=0.0, kind="box"):
+def add_slider(layout, chance, view, *, z, x, y, size, speed, heading, spin=0.0, kind="box"):
     """A block or ellipsoid that moves through the air or, with y None, over the floor, and may spin upright."""
-    half = size * rng.uniform(0.6, 1.3, 3)
+    half = size * chance.uniform(0.6, 1.3, 3)
     height = view.floor - half[1] if y is None else y * view.down * z
-    bob = 0.0 if y is None else rng.uniform(0, 0.4) * size
+    bob = 0.0 if y is None else chance.uniform(0, 0.4) * size
     add = layout.box if kind == "box" else layout.ball
     add(
         shape=sized(half), position=(x * view.across * z, height, z), turn=heading, velocity=(0, 0, speed),
-        sway=(0, bob, 0), rate=rng.uniform(0.2, 0.8), phase=rng.uniform(0, 6.3), spin=(0, spin, 0),
-        **finish(rng, view, z, size),
+        sway=(0, bob, 0), rate=chance.uniform(0.2, 0.8), phase=chance.uniform(0, 6.3), spin=(0, spin, 0),
+        **finish(chance, view, z, size),
     )  # fmt: skip
 
 
-def add_blob(layout, rng, view, *, z, x, y, size, speed, heading, amount, rate):
+def add_blob(layout, chance, view, *, z, x, y, size, speed, heading, amount, rate):
     """An ellipsoid that stretches and shears by `amount` while it drifts."""
-    raw = rng.normal(0, 1, (3, 3))
+    raw = chance.normal(0, 1, (3, 3))
     strain = amount * (raw + 0.6 * raw.T) / np.abs(raw + 0.6 * raw.T).max()
     layout.ball(
-        shape=sized(size * rng.uniform(0.7, 1.2, 3)), position=view.at(x, y, z), turn=heading,
-        velocity=(0, 0, speed), strain=strain, rate=rate, phase=rng.uniform(0, 6.3), **finish(rng, view, z, size),
+        shape=sized(size * chance.uniform(0.7, 1.2, 3)), position=view.at(x, y, z), turn=heading,
+        velocity=(0, 0, speed), strain=strain, rate=rate, phase=chance.uniform(0, 6.3), **finish(chance, view, z, size),
     )  # fmt: skip
 
 
-def add_walker(layout, rng, view, *, z, x, size, speed, heading, rate):
+def add_walker(layout, chance, view, *, z, x, size, speed, heading, rate):
     """A figure of half-height `size` whose arms and two-part legs swing from its trunk: chains of three."""
-    looks = [finish(rng, view, z, 0.5 * size) for _ in range(3)]
-    gait = dict(rate=rate, phase=rng.uniform(0, 6.3))
+    looks = [finish(chance, view, z, 0.5 * size) for _ in range(3)]
+    gait = dict(rate=rate, phase=chance.uniform(0, 6.3))
     hips = view.floor - 0.96 * size
     trunk = layout.box(
         shape=sized((0.22 * size, 0.32 * size, 0.14 * size), (0, -0.32 * size, 0)), turn=heading,
@@ -150,14 +152,14 @@ def add_walker(layout, rng, view, *, z, x, size, speed, heading, rate):
         )  # fmt: skip
 
 
-def add_pendulum(layout, rng, view, *, z, x, size, swing, rate):
+def add_pendulum(layout, chance, view, *, z, x, size, swing, rate):
     """A weight on a thin rod that swings from above the picture."""
-    top, length = -1.1 * view.down * z, rng.uniform(0.8, 1.4) * view.down * z
-    gait = dict(rate=rate, phase=rng.uniform(0, 6.3))
+    top, length = -1.1 * view.down * z, chance.uniform(0.8, 1.4) * view.down * z
+    gait = dict(rate=rate, phase=chance.uniform(0, 6.3))
     thin = 0.006 * view.width(z)
     rod = layout.box(
         shape=affine(np.diag([thin, length / 2, thin]), (0, length / 2, 0)), position=(x * view.across * z, top, z),
-        turn=rng.uniform(-0.5, 0.5), swing=(0.2 * swing, 0, swing), **gait, **finish(rng, view, z, length),
+        turn=chance.uniform(-0.5, 0.5), swing=(0.2 * swing, 0, swing), **gait, **finish(chance, view, z, length),
     )  # fmt: skip
-    add = layout.box if rng.random() < 0.4 else layout.ball
-    add(shape=sized((size,) * 3, (0, length, 0)), parent=rod, **finish(rng, view, z, size))
+    add = layout.box if chance.random() < 0.4 else layout.ball
+    add(shape=sized((size,) * 3, (0, length, 0)), parent=rod, **finish(chance, view, z, size))

@@ -1,7 +1,7 @@
 """Images, depths and material points of a simulated scene.
 
-    H W      rows and columns
-    S        samples along each side of a pixel
+H W      rows and columns
+S        samples along each side of a pixel
 """
 
 import jax
@@ -44,16 +44,19 @@ def seen_surface(scene, camera, time, *, height, width):
     return Frame(None, hit.distance, hit.body, jnp.stack(point, axis=-1))
 
 
-def render(scene, camera, time, *, height, width, samples=2, key=None):
+def render(scene, camera, time, *, height, width, samples=2):
     """What a camera sees at a time.
 
     Args:
-      scene: `Scene`. camera: one `Camera`. time: () frames; exposure is read at the nearest whole one.
-      height, width: of the image. samples: rays along each side of a pixel for the image.
-      key: for the sensor's noise, where the scene has any; without it the image is clean.
+      scene: `Scene`.
+      camera: one `Camera`.
+      time: () frames; exposure is read at the nearest whole one.
+      height: of the image.
+      width: of the image.
+      samples: rays along each side of a pixel for the image.
 
     Returns:
-      `Frame`.
+      `Frame`, without the sensor's noise (`with_noise`).
     """
     bodies, effects = all_bodies(scene), scene.effects
     u, v = _pixel_grid(height, width, camera.intrinsics.dtype)
@@ -76,7 +79,12 @@ def render(scene, camera, time, *, height, width, samples=2, key=None):
     image = jnp.stack(total, axis=-1) / count
     if effects.exposure is not None:
         image = image * jnp.take(effects.exposure, jnp.round(time).astype(jnp.int32), axis=0)[None, None]
-    if effects.noise is not None and key is not None:
-        image = image + effects.noise * jax.random.normal(key, image.shape, image.dtype)
     frame = seen_surface(scene, camera, time, height=height, width=width)
     return frame._replace(image=jnp.clip(image, 0, 1))
+
+
+def with_noise(key, image, effects):
+    """The image with the sensor's noise, in [0, 1]; unchanged where the effects have none."""
+    if effects.noise is None:
+        return image
+    return jnp.clip(image + effects.noise * jax.random.normal(key, image.shape, image.dtype), 0, 1)

@@ -1,7 +1,7 @@
 """Where the cameras stand: rigs that are revisited, and handheld paths. Host arrays, layout axes.
 
-    N        cameras or frames
-    width    of the view at a distance: 2 * tan(half the horizontal field of view) * distance
+N        cameras or frames
+width    of the view at a distance: 2 * tan(half the horizontal field of view) * distance
 """
 
 import numpy as np
@@ -21,8 +21,10 @@ def cameras_at(positions, angles, intrinsics, *, unit=1.0):
     """Cameras from places and small turns.
 
     Args:
-      positions: (N, 3) layout units. angles: (N, 3) yaw to the right, pitch down, roll, radians.
-      intrinsics: (3, 3). unit: world units per layout unit.
+      positions: (N, 3) layout units.
+      angles: (N, 3) yaw to the right, pitch down, roll, radians.
+      intrinsics: (3, 3).
+      unit: world units per layout unit.
 
     Returns:
       `Camera` with (N, ...) float32 leaves on the host.
@@ -52,8 +54,10 @@ def rig_positions(spacing, *, kind="arc", bend=0.0, count=RIG):
     """(N, 3) places of a rig.
 
     Args:
-      spacing: between neighbours. kind: "arc", "rows" (two rows, one above the other) or "zigzag".
+      spacing: between neighbours.
+      kind: "arc", "rows" (two rows, one above the other) or "zigzag".
       bend: how far the ends come forward, as a share of the rig's length.
+      count: N.
     """
     rows = 2 if kind == "rows" else 1
     column = np.arange(count) % (count // rows)
@@ -67,32 +71,38 @@ def rig_positions(spacing, *, kind="arc", bend=0.0, count=RIG):
     return np.stack([x, y, bend * 2 * half * (x / half) ** 2], -1)
 
 
-def smooth_walk(rng, count, columns, *, waves=3):
+def smooth_walk(chance, count, columns, *, waves=3):
     """(count, columns) smooth random curves of about unit amplitude and mean 0."""
     t = np.arange(count)[:, None, None] / max(count, 2)
-    waves = rng.uniform(0.3, 2.5, (1, columns, waves))
-    curves = (np.sin(2 * np.pi * (waves * t + rng.random(waves.shape))) / waves).sum(-1)
+    waves = chance.uniform(0.3, 2.5, (1, columns, waves))
+    curves = (np.sin(2 * np.pi * (waves * t + chance.random(waves.shape))) / waves).sum(-1)
     curves = curves - curves.mean(0)
     return curves / np.maximum(np.abs(curves).max(0), 1e-6)
 
 
-def handheld_path(rng, count, step, focus):
+def handheld_path(chance, count, step, focus):
     """Places and turns of a hand that drifts sideways while it shakes.
 
     Args:
-      rng: `numpy.random.Generator`. count: frames. step: drift per frame, layout units.
+      chance: `numpy.random.Generator`.
+      count: N.
+      step: drift per frame, layout units.
       focus: distance of what the hand keeps in view.
 
     Returns:
       positions (N, 3), angles (N, 3).
     """
-    heading = rng.uniform(-np.pi, np.pi)
+    heading = chance.uniform(-np.pi, np.pi)
     lateral = np.array([np.cos(heading), 0.25 * np.sin(heading), 0.0])
-    forward = np.array([0, 0, rng.normal(0, 0.25)])
+    forward = np.array([0, 0, chance.normal(0, 0.25)])
     t = (np.arange(count) - (count - 1) / 2)[:, None]
-    positions = step * (t * (lateral + forward) + smooth_walk(rng, count, 3) * [0.15 * count, 0.08 * count, 0.06 * count])
-    positions += rng.normal(0, 0.1 * step, positions.shape)
+    positions = step * (
+        t * (lateral + forward) + smooth_walk(chance, count, 3) * [0.15 * count, 0.08 * count, 0.06 * count]
+    )
+    positions += chance.normal(0, 0.1 * step, positions.shape)
     positions[:, 2] = np.clip(positions[:, 2], -0.5, 0.35)
-    angles = angles_towards(positions, (0, 0, focus)) * rng.uniform(-0.2, 1.0)
-    shake = smooth_walk(rng, count, 3) * rng.uniform(0, 0.03) + rng.normal(0, rng.uniform(0, 0.003), (count, 3))
+    angles = angles_towards(positions, (0, 0, focus)) * chance.uniform(-0.2, 1.0)
+    shake = smooth_walk(chance, count, 3) * chance.uniform(0, 0.03) + chance.normal(
+        0, chance.uniform(0, 0.003), (count, 3)
+    )
     return positions, angles + shake * [1, 1, 0.7]

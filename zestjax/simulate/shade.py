@@ -1,6 +1,6 @@
 """Colour of what a ray met: texture, light, shadow and highlight.
 
-    R        any ray axes; a vector is a tuple of three arrays, as in `cast`
+R        any ray axes; a vector is a tuple of three arrays, as in `cast`
 """
 
 from typing import NamedTuple
@@ -57,7 +57,11 @@ def texel(atlas, slot, u, v, level):
     """Bilinear lookup of a packed atlas.
 
     Args:
-      atlas: (T,) uint32. slot: (R) int32. u, v: (R) tiles, mirrored beyond [0, 1]. level: (R) int32.
+      atlas: (T,) uint32.
+      slot: (R) int32.
+      u: (R) tiles across, mirrored beyond [0, 1].
+      v: (R) tiles down, likewise.
+      level: (R) int32 times the tiles are halved.
 
     Returns:
       colour, a vector of (R) in [0, 1].
@@ -91,8 +95,12 @@ def shaded(scene, bodies, placed, hit, origin, direction, sample_angle):
     """Colours of rays, before exposure.
 
     Args:
-      scene: `Scene`; bodies: all its `Bodies`; placed: `Placed` at the ray's time.
-      hit: `Hit` of the rays from `origin`, a vector of (), along `direction`, a vector of (R).
+      scene: `Scene`.
+      bodies: all its `Bodies`.
+      placed: `Placed` at the rays' time.
+      hit: `Hit` of the rays.
+      origin: vector of ().
+      direction: vector of (R).
       sample_angle: () width of a sample at distance 1 of the ray parameter.
 
     Returns:

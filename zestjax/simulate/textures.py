@@ -31,7 +31,7 @@ def photograph(name):
     Raises:
       ValueError: where the file is missing or unreadable.
     """
-    path = Path(skimage.__file__).parent / "data" / name
+    path = Path(str(skimage.__file__)).parent / "data" / name
     image = cv2.imread(str(path)) if path.exists() else None
     if image is None:
         raise ValueError(f"photograph: {path} is missing or unreadable; reinstall scikit-image.")
@@ -41,75 +41,80 @@ def photograph(name):
     return np.ascontiguousarray(image[..., ::-1])
 
 
-def _crop(rng, image):
+def _crop(chance, image):
     """A tile from a random similar-shaped part of an image, mirrored beyond its borders."""
     height, width = image.shape[:2]
-    side = min(height, width) * rng.uniform(0.35, 1.0)
-    angle = rng.normal(0, 0.15) + (np.pi / 2) * (rng.integers(4) if rng.random() < 0.3 else 0)
+    side = min(height, width) * chance.uniform(0.35, 1.0)
+    angle = chance.normal(0, 0.15) + (np.pi / 2) * (chance.integers(4) if chance.random() < 0.3 else 0)
     turn = side / TILE * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    middle = np.array([rng.uniform(side / 2, width - side / 2), rng.uniform(side / 2, height - side / 2)])
+    middle = np.array([chance.uniform(side / 2, width - side / 2), chance.uniform(side / 2, height - side / 2)])
     matrix = np.concatenate([turn, (middle - turn @ [TILE / 2, TILE / 2])[:, None]], axis=1)
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(image, matrix, (TILE, TILE), flags=flags, borderMode=cv2.BORDER_REFLECT_101)
 
 
-def noise_tile(rng, *, coarsest=4, decay=0.55):
+def noise_tile(chance, *, coarsest=4, decay=0.55):
     """(TILE, TILE) smooth value noise in [0, 1]: octaves of interpolated random grids."""
     total, weight, cells = np.zeros((TILE, TILE), np.float32), 1.0, coarsest
     while cells <= TILE // 2:
-        grid = rng.random((cells, cells), dtype=np.float32)
+        grid = chance.random((cells, cells), dtype=np.float32)
         total += weight * cv2.resize(grid, (TILE, TILE), interpolation=cv2.INTER_CUBIC)
         weight, cells = weight * decay, cells * 2
     low, high = np.percentile(total, [2, 98])
     return np.clip((total - low) / (high - low), 0, 1)
 
 
-def _pattern_tile(rng):
+def _pattern_tile(chance):
     """(TILE, TILE) stripes, checks, dots or rings in [0, 1]."""
     v, u = np.mgrid[:TILE, :TILE].astype(np.float32) / TILE
-    count = 2.0 ** rng.uniform(1.5, 4)
-    angle = rng.uniform(0, np.pi)
+    count = 2.0 ** chance.uniform(1.5, 4)
+    angle = chance.uniform(0, np.pi)
     a, b = u * np.cos(angle) + v * np.sin(angle), v * np.cos(angle) - u * np.sin(angle)
     wave_a, wave_b = np.sin(2 * np.pi * count * a), np.sin(2 * np.pi * count * b)
-    kind = rng.integers(4)
-    waves = (wave_a, wave_a * wave_b, np.minimum(wave_a, wave_b), np.sin(2 * np.pi * count * np.hypot(u - 0.5, v - 0.5)))
-    return np.clip(0.5 + waves[kind] * rng.uniform(1, 6), 0, 1).astype(np.float32)
+    kind = chance.integers(4)
+    waves = (
+        wave_a,
+        wave_a * wave_b,
+        np.minimum(wave_a, wave_b),
+        np.sin(2 * np.pi * count * np.hypot(u - 0.5, v - 0.5)),
+    )
+    return np.clip(0.5 + waves[kind] * chance.uniform(1, 6), 0, 1).astype(np.float32)
 
 
-def _coloured(rng, grey):
+def _coloured(chance, grey):
     """(TILE, TILE, 3) float from a grey tile in [0, 1], running between two random colours."""
-    low, high = rng.uniform(0, 0.55, 3), rng.uniform(0.4, 1, 3)
+    low, high = chance.uniform(0, 0.55, 3), chance.uniform(0.4, 1, 3)
     mean = 0.5 * (low.mean() + high.mean())
     low, high = 0.45 * mean + 0.55 * low, 0.3 * mean + 0.7 * high
     return (low + (high - low) * grey[..., None]).astype(np.float32)
 
 
-def _graded(rng, tile):
+def _graded(chance, tile):
     """Random exposure, contrast and saturation, as of another camera on another day."""
     grey = tile.mean(axis=-1, keepdims=True)
-    tile = grey + (tile - grey) * rng.uniform(0.3, 1.3)
+    tile = grey + (tile - grey) * chance.uniform(0.3, 1.3)
     centre = tile.mean()
-    return (tile - centre) * rng.uniform(0.5, 1.4) + np.clip(centre * rng.uniform(0.7, 1.3), 0.15, 0.8)
+    return (tile - centre) * chance.uniform(0.5, 1.4) + np.clip(centre * chance.uniform(0.7, 1.3), 0.15, 0.8)
 
 
-def random_tile(rng, split):
+def random_tile(chance, split):
     """One texture of a split ("training" or "bench"): (TILE, TILE, 3) uint8."""
-    kind = rng.random()
+    kind = chance.random()
     if kind < 0.68:
         names = PHOTOGRAPHS[split]
-        tile = _crop(rng, photograph(names[rng.integers(len(names))])).astype(np.float32) / 255
+        tile = _crop(chance, photograph(names[chance.integers(len(names))])).astype(np.float32) / 255
         spread = np.abs(tile[..., 0] - tile[..., 2]).mean()
-        if spread < 0.01 or rng.random() < 0.15:
-            tile = _coloured(rng, tile.mean(axis=-1))
-        if rng.random() < 0.2:
-            tile = tile[..., rng.permutation(3)]
+        if spread < 0.01 or chance.random() < 0.15:
+            tile = _coloured(chance, tile.mean(axis=-1))
+        if chance.random() < 0.2:
+            tile = tile[..., chance.permutation(3)]
     else:
-        grey = noise_tile(rng, coarsest=int(2 ** rng.integers(1, 5)), decay=rng.uniform(0.45, 0.9))
-        grey = _pattern_tile(rng) * 0.7 + 0.3 * grey if kind > 0.9 else grey
-        tile = _coloured(rng, grey)
-    if rng.random() < 0.4:
-        tile = tile * (1 - rng.uniform(0.1, 0.5) * noise_tile(rng, decay=rng.uniform(0.5, 0.95))[..., None])
-    return (np.clip(_graded(rng, tile), 0, 1) * 255).astype(np.uint8)
+        grey = noise_tile(chance, coarsest=int(2 ** chance.integers(1, 5)), decay=chance.uniform(0.45, 0.9))
+        grey = _pattern_tile(chance) * 0.7 + 0.3 * grey if kind > 0.9 else grey
+        tile = _coloured(chance, grey)
+    if chance.random() < 0.4:
+        tile = tile * (1 - chance.uniform(0.1, 0.5) * noise_tile(chance, decay=chance.uniform(0.5, 0.95))[..., None])
+    return (np.clip(_graded(chance, tile), 0, 1) * 255).astype(np.uint8)
 
 
 def packed_atlas(tiles):
@@ -123,6 +128,6 @@ def packed_atlas(tiles):
     return np.concatenate(levels)
 
 
-def random_atlas(rng, split, *, slots=SLOTS):
+def random_atlas(chance, split, *, slots=SLOTS):
     """(T,) uint32 packed atlas of `slots` random textures of one split."""
-    return packed_atlas(np.stack([random_tile(rng, split) for _ in range(slots)]))
+    return packed_atlas(np.stack([random_tile(chance, split) for _ in range(slots)]))

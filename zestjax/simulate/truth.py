@@ -1,6 +1,6 @@
 """Exact answers: where every visible material point goes, and whether another view sees it.
 
-    H W      rows and columns
+H W      rows and columns
 """
 
 from typing import NamedTuple
@@ -62,7 +62,10 @@ def seen_from(scene, camera, time, points, *, tolerance=2e-3):
     """Does a camera see world points at a time?
 
     Args:
-      scene: `Scene`. camera: one `Camera`. time: (). points: (..., 3).
+      scene: `Scene`.
+      camera: one `Camera`.
+      time: () frames.
+      points: (..., 3) world.
       tolerance: a surface nearer by less than this share of the distance does not hide the point.
 
     Returns:
@@ -81,7 +84,12 @@ def correspond(scene, frame, camera, time, camera_there, time_there):
     """From the pixels of one view to another view at another time.
 
     Args:
-      scene: `Scene`. frame: what `camera` sees at `time`. camera_there, time_there: the other view, of the same size.
+      scene: `Scene`.
+      frame: what `camera` sees at `time`.
+      camera: one `Camera`.
+      time: () frames.
+      camera_there: the other view's, for an image of the same size.
+      time_there: the other view's.
 
     Returns:
       `Correspondence`; of a ray that meets nothing, not visible.

@@ -1,9 +1,9 @@
 """What a simulated scene is: arrays only, so that scenes of one shape share one compiled program.
 
-    B        bodies: boxes first, then balls
-    N        times a scene has tables for
-    T        texels of the packed atlas, all levels
-    unit body  the box [-1, 1]^3 or the ball of radius 1
+B        bodies: boxes first, then balls
+N        times a scene has tables for
+T        texels of the packed atlas, all levels
+unit body  the box [-1, 1]^3 or the ball of radius 1
 """
 
 from dataclasses import dataclass
