@@ -26,6 +26,11 @@ def ring(dtype=jnp.float32):
 
 @functools.cache
 def scene(dtype=jnp.float32):
+    """`drawn`, compiled at once: a hundred small programs take ten times as long."""
+    return jax.jit(drawn, static_argnums=0)(dtype)
+
+
+def drawn(dtype):
     """tables, homographies, grid, trust maps and depths of a small sweep."""
     views, depths = ring(dtype), planesweep.plane_depths(2.0, 8.0, D, spacing="inverse").astype(dtype)
     homographies = planesweep.homographies(jax.tree.map(lambda x: x[0], views), views, depths)
@@ -123,16 +128,18 @@ def test_the_gradient_written_by_hand_is_that_of_the_stacked_form(x64):
         return tuple(cost_volume.cost_volume(tables, homographies, grid, **options))
 
     plain = lambda *args: stacked(*args, grid=grid, depths=depths)
+    shapes = jax.eval_shape(plain, tables, homographies, maps)
+    rng = np.random.default_rng(0)
+    cotangent = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in shapes)
     both = []
     for fn in (streamed, plain):
 
         @jax.jit
-        def value_and_pull(*args, fn=fn):
+        def value_and_pull(cotangent, *args, fn=fn):
             value, pull = jax.vjp(fn, *args)
-            cotangent = [jax.random.normal(jax.random.key(k), x.shape, x.dtype) for k, x in enumerate(value)]
-            return value, pull(tuple(cotangent))
+            return value, pull(cotangent)
 
-        both.append(value_and_pull(tables, homographies, maps))
+        both.append(value_and_pull(cotangent, tables, homographies, maps))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8), *both)
 
 
@@ -222,17 +229,21 @@ def test_a_covered_view_leaves_the_mean():
 
 def test_the_variance_is_smallest_at_the_true_depth():
     """A pattern painted on the plane z = 4 of the reference camera, in eight planes of which one is there."""
-    views = ring()
-    reference = jax.tree.map(lambda x: x[0], views)
     grid = planesweep.sweep_grid(H, W)
 
-    def paint(view):
+    def paint(reference, view):
         to_reference = jnp.linalg.inv(planesweep.plane_homography(reference, view, jnp.float32(4.0)))
         u, v, _, _ = planesweep.carry(to_reference, grid)
         return jnp.stack([jnp.sin(0.7 * u), jnp.cos(0.8 * v)], -1)
 
-    depths = jnp.asarray([2.0, 2.5, 3.2, 4.0, 5.0, 6.0])
-    volume = sweep(jax.vmap(paint)(views), planesweep.homographies(reference, views, depths), grid)
+    @jax.jit
+    def swept(depths):
+        views = ring()
+        reference = jax.tree.map(lambda x: x[0], views)
+        tables = jax.vmap(paint, in_axes=(None, 0))(reference, views)
+        return cost_volume.cost_volume(tables, planesweep.homographies(reference, views, depths), grid)
+
+    volume = swept(jnp.asarray([2.0, 2.5, 3.2, 4.0, 5.0, 6.0]))
     cost = jnp.where(volume.count[..., None] >= 2, volume.variance, jnp.nan)
     assert int(jnp.nanargmin(jnp.nanmean(cost, axis=(1, 2, 3)))) == 3
 
@@ -289,7 +300,7 @@ def test_wrong_arguments_are_refused():
         cost_volume.quarter_colours(jnp.zeros((6, 8, 3)))
 
 
-def published(g, padding):
+def published(g):
     """Inputs of MVSNeRF's recorded volume, in our layout."""
     views = cameras.scaled(Camera(jnp.asarray(g["intrinsics"][:3]), jnp.asarray(g["w2cs"][:3])), 0.25, 0.25)
     depths = planesweep.plane_depths(*g["near_far"], 16)
@@ -301,7 +312,7 @@ def published(g, padding):
 
 def test_the_published_volume_is_mvsnerfs_to_its_negative_variances():
     g = golden("mvsnerf_golden.npz")
-    volume = cost_volume.mvsnerf_cost_volume(*published(g, 4), padding=4)
+    volume = jax.jit(lambda: cost_volume.mvsnerf_cost_volume(*published(g), padding=4))()
     assert volume.min() < -50
     np.testing.assert_allclose(jnp.moveaxis(volume, -1, 0), g["cost_pad4_train"], rtol=1e-3, atol=5e-3)
 
@@ -310,10 +321,13 @@ def test_the_published_volume_may_keep_the_first_three_views_colours_only():
     g = golden("zest_funcs_golden.npz")
     features, images, matrices = (jnp.asarray(g[f"cv_{name}"]) for name in ("feats", "imgs", "proj"))
     depths = jnp.asarray(g["cv_depth"])
-    homographies = matrices[None, ..., :3] * jnp.ones((8, 1, 1, 1))
-    homographies = homographies.at[..., 2].add(matrices[None, ..., 3] / depths[:, None, None])
-    colours = cost_volume.quarter_colours(jnp.moveaxis(images, 1, -1))
-    volume = cost_volume.mvsnerf_cost_volume(
-        jnp.moveaxis(features, 1, -1), colours, homographies, padding=4, colour_views=3
-    )
+
+    @jax.jit
+    def volume_of(features, images):
+        homographies = matrices[None, ..., :3] * jnp.ones((8, 1, 1, 1))
+        homographies = homographies.at[..., 2].add(matrices[None, ..., 3] / depths[:, None, None])
+        colours = cost_volume.quarter_colours(images)
+        return cost_volume.mvsnerf_cost_volume(features, colours, homographies, padding=4, colour_views=3)
+
+    volume = volume_of(jnp.moveaxis(features, 1, -1), jnp.moveaxis(images, 1, -1))
     np.testing.assert_allclose(jnp.moveaxis(volume, -1, 0), g["cv_cost"], rtol=1e-3, atol=5e-3)

@@ -12,11 +12,12 @@ from zestjax.frustum import Frustum
 from zestjax.rays import SPACINGS
 
 H, W = 24, 32
+look_at, project, unproject = jax.jit(cameras.look_at), jax.jit(cameras.project), jax.jit(cameras.unproject)
 K = np.array([[30.0, 0, 15.5], [0, 28, 11.5], [0, 0, 1]], "f")
 
 
 def scene(dtype=jnp.float32, height=H, width=W):
-    pose = cameras.look_at(jnp.asarray([1.0, -0.5, 0.2]), jnp.asarray([0.0, 0, 5]), up=jnp.asarray([0.0, -1, 0]))
+    pose = look_at(jnp.asarray([1.0, -0.5, 0.2]), jnp.asarray([0.0, 0, 5]), up=jnp.asarray([0.0, -1, 0]))
     camera = Camera(jnp.asarray(K, dtype), pose.astype(dtype))
     return Frustum(camera, jnp.asarray(1.5, dtype), jnp.asarray(20.0, dtype), height, width)
 
@@ -25,7 +26,7 @@ def scene(dtype=jnp.float32, height=H, width=W):
 def test_the_image_corners_at_near_and_far_are_the_cubes(spacing):
     pixels = jnp.asarray([[0.0, 0], [W - 1, 0], [0, H - 1], [W - 1, H - 1]])
     for z, depth in ((0, 1.5), (1, 20.0)):
-        points = cameras.unproject(scene().camera, pixels, jnp.full(4, depth))
+        points = unproject(scene().camera, pixels, jnp.full(4, depth))
         coords = frustum.frustum_from_world(scene(), points, spacing=spacing)
         np.testing.assert_allclose(coords, [[0, 0, z], [1, 0, z], [0, 1, z], [1, 1, z]], atol=2e-5)
 
@@ -43,7 +44,7 @@ def test_world_from_frustum_inverts_frustum_from_world(spacing, size):
 def test_inverse_spacing_is_linear_in_inverse_depth():
     coords = jnp.asarray([[0.3, 0.6, z] for z in (0.0, 0.25, 0.5, 1.0)])
     points = frustum.world_from_frustum(scene(), coords, spacing="inverse")
-    depth = cameras.project(scene().camera, points).depth
+    depth = project(scene().camera, points).depth
     np.testing.assert_allclose(1 / depth, 1 / 1.5 + np.array([0, 0.25, 0.5, 1]) * (1 / 20 - 1 / 1.5), rtol=1e-4)
 
 
@@ -76,7 +77,7 @@ def test_cells_of_the_scaled_camera_are_feature_pixels():
     h, w, planes = 7, 9, 5
     small = Frustum(cameras.scaled(full.camera, 0.25, 0.25), full.near, full.far, h, w)
     pixels, depth = jnp.asarray([[12.0, 20.0], [0, 4]]), jnp.asarray([1.5, 20.0])
-    coords = frustum.frustum_from_world(small, cameras.unproject(full.camera, pixels, depth))
+    coords = frustum.frustum_from_world(small, unproject(full.camera, pixels, depth))
     np.testing.assert_allclose(frustum.cells_from_frustum(coords, planes, h, w), [[0, 5, 3], [4, 1, 0]], atol=1e-4)
 
 

@@ -11,7 +11,9 @@ from zestjax.cameras import Camera
 
 H, W = 20, 24
 K = np.array([[30.0, 0.2, 11.5], [0, 28, 9.5], [0, 0, 1]], "f")
-warp = jax.jit(planesweep.warp)
+warp, carry = jax.jit(planesweep.warp), jax.jit(planesweep.carry)
+homography_of, homographies_of = jax.jit(planesweep.plane_homography), jax.jit(planesweep.homographies)
+look_at, project, unproject = jax.jit(cameras.look_at), jax.jit(cameras.project), jax.jit(cameras.unproject)
 
 
 def at(x, dtype=jnp.float32):
@@ -21,7 +23,7 @@ def at(x, dtype=jnp.float32):
 def ring(dtype=jnp.float32):
     """Four views of one place, of different intrinsics."""
     positions = jnp.asarray([[0.0, 0, 0], [0.8, 0.1, 0], [-0.5, 0.4, 0.3], [0.2, -0.6, -0.4]])
-    pose = cameras.look_at(positions, jnp.tile(jnp.asarray([[0.0, 0, 5]]), (4, 1)), up=jnp.asarray([0.0, -1, 0]))
+    pose = look_at(positions, jnp.tile(jnp.asarray([[0.0, 0, 5]]), (4, 1)), up=jnp.asarray([0.0, -1, 0]))
     intrinsics = np.stack([K * [[scale, 1, 1], [1, scale, 1], [1, 1, 1]] for scale in (1, 1.1, 0.9, 1.2)])
     return Camera(jnp.asarray(intrinsics, dtype), pose.astype(dtype))
 
@@ -32,27 +34,27 @@ def one(views, k):
 
 @pytest.mark.parametrize("depth", [0.1, 1.0, 50.0])
 def test_a_camera_sees_itself_unmoved(depth):
-    homography = planesweep.plane_homography(at(0.3), at(0.3), jnp.float32(depth))
+    homography = homography_of(at(0.3), at(0.3), jnp.float32(depth))
     np.testing.assert_allclose(homography @ jnp.asarray([10.0, 5.0, 1.0]), [10, 5, 1], atol=1e-4)
 
 
 @pytest.mark.parametrize("depth", [0.5, 2.0, 40.0])
 def test_a_sideways_step_shifts_a_pixel_by_focal_times_baseline_over_depth(depth):
-    u, v, w = planesweep.plane_homography(at(0.0), at(0.3), jnp.float32(depth)) @ jnp.asarray([10.0, 5.0, 1.0])
+    u, v, w = homography_of(at(0.0), at(0.3), jnp.float32(depth)) @ jnp.asarray([10.0, 5.0, 1.0])
     np.testing.assert_allclose([u / w, v / w], [10 - 30 * 0.3 / depth, 5], rtol=1e-5, atol=1e-4)
 
 
 def test_homographies_agree_with_unproject_and_project_in_pixel_and_in_depth():
     """d (H p)_3 is the depth of the plane's point in the source: what the trust test relies on."""
     views, depths = ring(), planesweep.plane_depths(2.0, 9.0, 5, spacing="inverse")
-    homographies = planesweep.homographies(one(views, 0), views, depths)
+    homographies = homographies_of(one(views, 0), views, depths)
     assert homographies.shape == (5, 4, 3, 3)
     grid = planesweep.sweep_grid(H, W)
     for k, depth in enumerate(depths):
-        points = cameras.unproject(one(views, 0), grid[..., :2], jnp.full((H, W), depth))
+        points = unproject(one(views, 0), grid[..., :2], jnp.full((H, W), depth))
         for v in range(4):
-            expected = cameras.project(one(views, v), points)
-            u, w, share, in_front = planesweep.carry(homographies[k, v], grid)
+            expected = project(one(views, v), points)
+            u, w, share, in_front = carry(homographies[k, v], grid)
             np.testing.assert_allclose(jnp.stack([u, w], -1), expected.pixels, atol=2e-3)
             np.testing.assert_allclose(share * depth, expected.depth, rtol=1e-4)
             assert in_front.all()
@@ -63,10 +65,10 @@ def test_homographies_are_mvsnerfs_grids():
     views = Camera(jnp.asarray(g["intrinsics"]), jnp.asarray(g["w2cs"]))
     small = cameras.scaled(views, 0.25, 0.25)
     depths = planesweep.plane_depths(*g["near_far"], 16)
-    homographies = planesweep.homographies(one(small, 0), small, depths)
+    homographies = homographies_of(one(small, 0), small, depths)
     grid = planesweep.sweep_grid(16, 24, padding=4)
     for view, name in ((1, "grid1_pad4"), (2, "grid2_pad4")):
-        u, v, _, _ = planesweep.carry(homographies[:, view], grid)
+        u, v, _, _ = carry(homographies[:, view], grid)
         ours = jnp.stack([u / 11.5 - 1, v / 7.5 - 1], -1)
         np.testing.assert_allclose(ours, g[name], atol=2e-5)
 
@@ -76,8 +78,8 @@ def test_a_warp_at_the_true_depth_shows_the_reference_view():
     paint = lambda points: jnp.stack([jnp.sin(points[..., 0]), jnp.cos(points[..., 1])], -1)
     source, reference = at(0.5), at(0.0)
     grid = planesweep.sweep_grid(H, W)
-    seen_by = lambda camera: paint(cameras.unproject(camera, grid[..., :2], jnp.full((H, W), 4.0)))
-    homography = planesweep.plane_homography(reference, source, jnp.float32(4.0))
+    seen_by = lambda camera: paint(unproject(camera, grid[..., :2], jnp.full((H, W), 4.0)))
+    homography = homography_of(reference, source, jnp.float32(4.0))
     values, visible = warp(seen_by(source), homography, grid)
     assert visible.mean() > 0.8
     np.testing.assert_allclose(values[visible], seen_by(reference)[visible], atol=3e-3)
@@ -86,14 +88,14 @@ def test_a_warp_at_the_true_depth_shows_the_reference_view():
 
 def test_what_is_behind_the_source_is_not_visible_and_stays_finite():
     turned = Camera(jnp.asarray(K), jnp.diag(jnp.asarray([-1.0, 1, -1, 1])))  # looks the other way, mirrored pixels
-    homography = planesweep.plane_homography(at(0.0), turned, jnp.float32(3.0))
+    homography = homography_of(at(0.0), turned, jnp.float32(3.0))
     grid = planesweep.sweep_grid(H, W)
     assert not warp(jnp.ones((H, W, 2)), homography, grid).visible.any()
     assert_finite(lambda i, h: planesweep.warp(i, h, grid).values, jnp.ones((H, W, 2)), homography)
 
 
 def test_a_plane_through_the_source_centre_stays_finite():
-    homography = planesweep.plane_homography(at(0.0), at(0.0), jnp.float32(1.0)).at[2].set(0)
+    homography = homography_of(at(0.0), at(0.0), jnp.float32(1.0)).at[2].set(0)
     grid = planesweep.sweep_grid(H, W)
     assert not warp(jnp.ones((H, W, 2)), homography, grid).visible.any()
     assert_finite(lambda i, h: planesweep.warp(i, h, grid).values, jnp.ones((H, W, 2)), homography)
@@ -102,7 +104,7 @@ def test_a_plane_through_the_source_centre_stays_finite():
 def test_gradients_match_finite_differences(x64):
     views, grid = ring(jnp.float64), planesweep.sweep_grid(H, W, dtype=jnp.float64)[1::7, 1::6]
     image = jax.random.normal(jax.random.key(0), (H, W, 1), jnp.float64)
-    homography = lambda depth: planesweep.plane_homography(one(views, 0), one(views, 1), depth)
+    homography = lambda depth: homography_of(one(views, 0), one(views, 1), depth)
     assert_grads_match(homography, jnp.asarray(3.0))
     assert_grads_match(lambda i, d: planesweep.warp(i, homography(d), grid).values, image, jnp.asarray(3.17))
 

@@ -10,6 +10,8 @@ from zestjax import cameras, trust
 from zestjax.cameras import Camera
 from zestjax.trust import Trust
 
+trusted_at, unproject = jax.jit(trust.trusted_at), jax.jit(cameras.unproject)
+
 
 def test_trust_is_the_printed_formula():
     rng = np.random.default_rng(0)
@@ -59,21 +61,21 @@ def wall():
 def test_a_covered_wall_is_trusted_only_where_it_is_seen():
     camera, maps = wall()
     pixels = jnp.asarray([[2.0, 5.0], [13.0, 5.0], [13.0, 5.0]])
-    points = cameras.unproject(camera, pixels, jnp.asarray([4.0, 4.0, 8.0]))
-    weights = trust.trusted_at(maps, camera, points)
+    points = unproject(camera, pixels, jnp.asarray([4.0, 4.0, 8.0]))
+    weights = trusted_at(maps, camera, points)
     np.testing.assert_allclose(weights, [0, 1, 0], atol=1e-6)
 
 
 def test_nothing_outside_or_behind_the_camera_is_trusted():
     camera, maps = wall()
     points = jnp.asarray([[0.0, 0, -3], [0, 0, 0], [50, 0, 4]])
-    np.testing.assert_array_equal(trust.trusted_at(maps, camera, points), 0)
+    np.testing.assert_array_equal(trusted_at(maps, camera, points), 0)
     assert_finite(lambda p: trust.trusted_at(maps, camera, p), points)
 
 
 def test_points_of_any_leading_shape():
     camera, maps = wall()
     points = jax.random.uniform(jax.random.key(0), (2, 5, 3)) + jnp.asarray([0.0, 0, 3])[None, None]
-    assert trust.trusted_at(maps, camera, points).shape == (2, 5)
+    assert trusted_at(maps, camera, points).shape == (2, 5)
     with pytest.raises(ValueError, match="trusted_at"):
         trust.trusted_at(maps, camera, jnp.ones(2))
