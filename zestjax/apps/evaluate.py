@@ -54,7 +54,7 @@ def evaluate(options):
     """
     model = open_weights(options.weights, system=options.system)
     if options.scene != "bench:all":
-        report = evaluate_scene(model, options, options.out)
+        report = evaluate_scene(model, options, Path(options.out))
         return f"evaluate: {headline(report)}: {Path(options.out) / 'metrics.json'}"
     from zestjax.simulate.bench import BENCH
 
@@ -73,8 +73,12 @@ def evaluate_scene(model, options, out):
     """
     opened = open_scene(options.scene, model.config, size=options.size, protocol=options.protocol,
                         targets=options.targets, layout=options.format)  # fmt: skip
-    scene, out, rows = opened.scene, Path(options.out if out is None else out), []
-    view_of = Renderer(model, scene.video)
+    return score_scene(Renderer(model, opened.scene.video), opened, options, out)
+
+
+def score_scene(view_of, opened, options, out):
+    """Score an opened scene's targets with its `Renderer`; see `evaluate_scene`."""
+    scene, model, rows = opened.scene, view_of.model, []
     for target in progress(scene.targets, scene.name, quiet=options.quiet):
         check_target(scene.name, scene.video, target.camera)
         rows.append(evaluate_target(view_of, scene, target, opened.ceiling, out if options.pictures else None))
@@ -90,10 +94,14 @@ def evaluate_scene(model, options, out):
 
 
 class Renderer:
-    """Views of one prepared video, timed; the first is rendered twice, so that no compile is counted as rendering."""
+    """Views of one prepared video, timed; the first is rendered twice, so that no compile is counted as rendering.
 
-    def __init__(self, model, video):
+    model: `weights.Model`. video: `Video`. changes: fields of the configuration replaced when rendering.
+    """
+
+    def __init__(self, model, video, **changes):
         self.model, self.compile_seconds = model, None
+        self.config = dataclasses.replace(model.config, **changes)
         self.video = jax.tree.map(jnp.asarray, video)
         prepare = lambda: jax.block_until_ready(novel_view.prepare(model.params, self.video, config=model.config))
         self.prepared, first = timed(prepare)
@@ -105,7 +113,7 @@ class Renderer:
         camera = jax.tree.map(jnp.asarray, camera)
         render = lambda: jax.block_until_ready(
             novel_view.render_view(
-                self.model.params, self.prepared, camera, frame_time, config=self.model.config, exclude=exclude
+                self.model.params, self.prepared, camera, frame_time, config=self.config, exclude=exclude
             )
         )
         view, seconds = timed(render)

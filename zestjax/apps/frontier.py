@@ -1,0 +1,160 @@
+"""`zestjax frontier`: what each setting costs and gives on one scene, with one set of weights.
+
+The settings vary samples per ray, depth planes, source views and resolution: one at a time, then together. A setting is
+on the frontier when no other is both faster and better.
+"""
+
+import csv
+import dataclasses
+import io
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from zestjax.apps.evaluate import Renderer
+from zestjax.apps.memory import peak_megabytes, reset_peak
+from zestjax.apps.progress import progress
+from zestjax.apps.render import scaled_video
+from zestjax.apps.scenes import open_scene
+from zestjax.apps.scoring import mean_scores, score_image
+from zestjax.apps.weights import open_weights
+from zestjax.cameras import resized
+from zestjax.io.files import write_bytes
+from zestjax.io.pictures import resize_area
+
+COLUMNS = ("setting", "psnr_full", "psnr_dynamic", "ssim_full", "seconds_per_frame", "peak_mb", "pareto")
+
+
+class Setting(NamedTuple):
+    """name: str. changes: fields of the `Config` replaced. scale: of the resolution."""
+
+    name: str
+    changes: dict
+    scale: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class FrontierOptions:
+    """The flags of `zestjax frontier`; see the command's help. targets: times, four of zest-bench unless told."""
+
+    scene: str
+    out: Path
+    weights: Path | None = None
+    size: tuple | None = None
+    targets: tuple | None = None
+    format: str | None = None
+    seed: int = 0
+    quiet: bool = False
+
+
+def settings_of(config):
+    """The settings tried with weights of a configuration; the first is its own."""
+    views, planes = config.key_frames, config.planes
+    tried = [Setting("as trained", {})]
+    if config.conditioning == "pooled":
+        tried += [Setting(f"{n} views", {"key_frames": n}) for n in (views * 3 // 2, views // 2, views // 4)]
+    tried += [Setting(f"{n} planes", {"planes": n}) for n in (planes * 3 // 2, planes // 2)]
+    if config.sampling == "guided":
+        tried += [
+            Setting(f"{n} regular samples", {"sampling": "regular", "samples": n})
+            for n in (planes // 2, planes, 2 * planes)
+        ]
+    else:
+        tried += [Setting(f"{n} samples", {"samples": n}) for n in (config.samples // 2, config.samples // 4)]
+    tried += [Setting(f"{scale} of the size", {}, scale) for scale in (0.75, 0.5)]
+    less = {"planes": planes // 2}
+    return [*tried, Setting(f"{planes // 2} planes, 0.75 of the size", less, 0.75)]
+
+
+def frontier(options):
+    """Run `zestjax frontier`.
+
+    Returns:
+      str, the summary line.
+
+    Raises:
+      ValueError, WeightsError: a scene or weights that cannot be used.
+    """
+    model, out = open_weights(options.weights), Path(options.out)
+    opened = open_scene(options.scene, model.config, size=options.size, protocol="held-out", layout=options.format,
+                        targets=options.targets or default_times(options))  # fmt: skip
+    scene, rows = opened.scene, []
+    for setting in progress(settings_of(model.config), "frontier", quiet=options.quiet):
+        rows.append({"setting": setting.name, **measure(model, scene, setting)})
+        write_rows(out, mark_pareto(rows))
+    draw(out / "frontier.png", rows, scene.name)
+    best, own = max(rows, key=lambda row: row["psnr_full"]), rows[0]
+    good = [row for row in rows if row["psnr_full"] >= best["psnr_full"] - 0.1]
+    fast = min(good, key=lambda row: row["seconds_per_frame"])
+    return (
+        f"frontier: on {scene.name} `{fast['setting']}` reaches {fast['psnr_full']:.2f} dB in "
+        f"{fast['seconds_per_frame']:.2f} s a frame, within 0.1 dB of the best; as trained "
+        f"{own['psnr_full']:.2f} dB in {own['seconds_per_frame']:.2f} s: {out / 'frontier.csv'}"
+    )
+
+
+def default_times(options):
+    """Four times spread over a scene of zest-bench; all there are of a folder."""
+    return (3, 9, 14, 20) if str(options.scene).startswith("bench:") else None
+
+
+def measure(model, scene, setting):
+    """A setting's row but for its name: mean scores, median seconds and the peak memory of the process meanwhile."""
+    reset_peak()
+    size = scene.video.images.shape[1:3]
+    video = scaled_video(scene.video, setting.scale)
+    factors = [new / old for new, old in zip(video.images.shape[1:3], size, strict=True)]
+    view_of = Renderer(model, video, **setting.changes)
+    scores, seconds = [], []
+    for target in scene.targets:
+        view, spent = view_of(resized(target.camera, factors[1], factors[0]), target.time, target.exclude)
+        image = resize_area(np.clip(np.asarray(view.colour, np.float32), 0, 1), *size)
+        scores.append(score_image(image, target.image, target.dynamic))
+        seconds.append(spent)
+    mean = mean_scores(scores)
+    dynamic = mean["dynamic"]["psnr"] if mean["dynamic"] else None
+    jax.clear_caches()
+    return {
+        "psnr_full": mean["full"]["psnr"], "psnr_dynamic": dynamic, "ssim_full": mean["full"]["ssim"],
+        "seconds_per_frame": float(np.median(seconds)), "peak_mb": peak_megabytes(),
+    }  # fmt: skip
+
+
+def mark_pareto(rows):
+    """The rows with `pareto` 1 where no other row is at least as fast and as good, and better in one; else 0."""
+    cost = lambda row: (row["seconds_per_frame"], -row["psnr_full"])
+    beats = lambda a, b: all(x <= y for x, y in zip(cost(a), cost(b), strict=True)) and cost(a) != cost(b)
+    for row in rows:
+        row["pareto"] = int(not any(beats(other, row) for other in rows))
+    return rows
+
+
+def write_rows(out, rows):
+    """Write `frontier.csv`."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    shown = lambda value: "" if value is None else round(value, 4) if isinstance(value, float) else value
+    writer.writerows({name: shown(row[name]) for name in COLUMNS} for row in rows)
+    write_bytes(out / "frontier.csv", text.getvalue().encode())
+
+
+def draw(path, rows, title):
+    """Write the plot: seconds against PSNR, the frontier joined and its settings named."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    best = sorted((row for row in rows if row["pareto"]), key=lambda row: row["seconds_per_frame"])
+    axes.plot(*np.array([(r["seconds_per_frame"], r["psnr_full"]) for r in best]).T, "o-", color="C0", label="frontier")
+    for row in rows:
+        place = (row["seconds_per_frame"], row["psnr_full"])
+        axes.plot(*place, "o", color="C0" if row["pareto"] else "0.7", zorder=0)
+        axes.annotate(row["setting"], place, xytext=(4, -9), textcoords="offset points", fontsize=7)
+    axes.set(xlabel="seconds per frame", ylabel="PSNR, full image (dB)", title=title, xscale="log")
+    axes.legend()
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    write_bytes(path, buffer.getvalue())
