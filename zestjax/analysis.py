@@ -1,9 +1,9 @@
 """Each input frame's own coarse depth and moving pixels: what decides which source view may be trusted at a point.
 
-    V        frames
-    h w      cells, a quarter of the image; 2h 2w are its half-resolution pixels
-    E        planes, uniform in inverse depth, the nearest first
-    coordinate  plane coordinate in [0, 1], linear in inverse depth: 0 at the near bound, 1 at the far one (a frustum's z)
+V        frames
+h w      cells, a quarter of the image; 2h 2w are its half-resolution pixels
+E        planes, uniform in inverse depth, the nearest first
+coordinate  plane coordinate in [0, 1], linear in inverse depth: 0 at the near bound, 1 at the far one (a frustum's z)
 """
 
 from typing import NamedTuple

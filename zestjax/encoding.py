@@ -1,10 +1,10 @@
 """Encoding volumes: source frames swept over the planes of one camera, compared, and encoded by a 3-D U-Net.
 
-    V        source frames: the K key-frames of the geometry volume, or the slots of the motion volume
-    D h w    planes (the nearest first), rows and columns of a volume
-    C        learned feature channels; a table holds C features, 3 colours, and of trusted frames 3 maps:
-             probability of moving, inverse depth of the visible surface, tolerance of it
-    votes    what the frames' own depths say about a cell: is it their surface, or do they look through it
+V        source frames: the K key-frames of the geometry volume, or the slots of the motion volume
+D h w    planes (the nearest first), rows and columns of a volume
+C        learned feature channels; a table holds C features, 3 colours, and of trusted frames 3 maps:
+         probability of moving, inverse depth of the visible surface, tolerance of it
+votes    what the frames' own depths say about a cell: is it their surface, or do they look through it
 """
 
 from typing import NamedTuple
@@ -22,6 +22,7 @@ from zestjax.planesweep import carry, homographies, sweep_grid
 from zestjax.trust import Trust, agreement
 
 TRUST_MAPS = 3
+CELL_COLOURS = 12  # the four half-resolution pixels of a cell
 VOTE_GAIN = 4.0
 
 
@@ -35,7 +36,7 @@ class VolumeParams(NamedTuple):
 
 
 class SweepViews(NamedTuple):
-    """tables: (V, h, w, C + 3), or C + 6 of trusted frames. cameras: `Camera` (V, ...) at the tables' resolution.
+    """tables: (V, h, w, C + colours + maps), see the header. cameras: `Camera` (V, ...) at the tables' resolution.
     valid: (V,) 1, or 0 for a slot the video does not fill."""
 
     tables: jax.Array
@@ -44,7 +45,8 @@ class SweepViews(NamedTuple):
 
 
 class Volume(NamedTuple):
-    """cells: (D, h, w, channels) encoded. logits: (D, h, w), a surface is here; None without guided sampling."""
+    """cells: (D, h, w, channels) encoded; with logits the last channel is their softmax along the ray.
+    logits: (D, h, w), a surface is here; None without guided sampling."""
 
     cells: jax.Array
     logits: jax.Array | None
@@ -71,14 +73,15 @@ def init_volume(key, *, features, views, widths, colours, trusted, slots, pyrami
       features: C.
       views: V, which decides the channels where every view's colours are kept.
       widths: of the 3-D U-Net.
-      colours: `all` keeps every view's warped colours (the paper's 32 + 3 V channels), `mean` their mean.
+      colours: `all` keeps every view's warped colour (the paper's 32 + 3 V channels), `mean` the mean and variance
+        of the cells' colours.
       trusted: whether tables carry trust maps.
       slots: whether votes are kept slot by slot (motion) or averaged over frames (geometry).
       pyramid_widths: of the feature net, or None without one.
       occupied: whether cells get a surface logit.
     """
     a, b, c = jax.random.split(key, 3)
-    channels = features + 3 * views if colours == "all" else features + 7
+    channels = features + (3 * views if colours == "all" else 2 * CELL_COLOURS + 1)
     channels += (3 * views if slots else 4) * trusted
     pyramid = None if pyramid_widths is None else init_feature_pyramid(a, widths=pyramid_widths)
     regulariser = init_cost_regulariser(b, channels, widths=widths)
@@ -147,15 +150,15 @@ def encode_volume(params, views, camera, size, depths, *, colours, trusted, slot
         trust = Trust(0.1 + 0.9 * moving if slots else 1 - moving, inverse_depth, tolerance)
     kept = TRUST_MAPS if trusted else 3 * (colours == "all")
     cost = cost_volume(tables, hom, grid, trust=trust, depths=depths if trusted else None, per_view=kept)
-    features = sizes["C"] - 3 - TRUST_MAPS * trusted
+    features = sizes["C"] - (3 if colours == "all" else CELL_COLOURS) - TRUST_MAPS * trusted
     variance = jnp.log1p(100 * cost.variance) / 4
     if colours == "all":
         flat = cost.samples.reshape(*cost.samples.shape[:3], -1)
         channels, vote = [cost.variance[..., :features], flat], 0
     else:
         count = cost.count[..., None] / sizes["V"]
-        mean = cost.mean[..., features : features + 3]
-        channels, vote = [variance[..., : features + 3], mean, count], 0
+        mean = cost.mean[..., features : features + CELL_COLOURS]
+        channels, vote = [variance[..., : features + CELL_COLOURS], mean, count], 0
     if trusted:
         votes = cell_votes(cost.samples, hom, grid, depths)
         extra, vote = (_motion_votes if slots else _geometry_votes)(votes)
@@ -163,4 +166,5 @@ def encode_volume(params, views, camera, size, depths, *, colours, trusted, slot
     cells = cost_regulariser(params.regulariser, jnp.concatenate(channels, axis=-1))
     if params.occupied is None:
         return Volume(cells, None)
-    return Volume(cells, dense(params.occupied, cells)[..., 0] + vote)
+    logits = dense(params.occupied, cells)[..., 0] + vote
+    return Volume(jnp.concatenate([cells, jax.nn.softmax(logits, axis=0)[..., None]], axis=-1), logits)

@@ -1,9 +1,9 @@
 """What a frame's own pixels say about its depth and its motion, without learning: computed once a frame, cached.
 
-    J        source frames compared with the reference frame
-    E        planes of the sweep, uniform in inverse depth, the nearest first
-    h w      rows and columns of a cell, a quarter of the image: cell j is centred on image pixel 4 j + 3/2
-    cost     truncated absolute colour difference / TRUNCATION, in [0, 1]; 1 where nothing can be compared
+J        source frames compared with the reference frame
+E        planes of the sweep, uniform in inverse depth, the nearest first
+h w      rows and columns of a cell, a quarter of the image: cell j is centred on image pixel 4 j + 3/2
+cost     truncated absolute colour difference / TRUNCATION, in [0, 1]; 1 where nothing can be compared
 """
 
 from typing import NamedTuple

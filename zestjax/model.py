@@ -1,9 +1,9 @@
 """The whole forward model: frames to volumes to fields to pixels.
 
-    V        source frames: K key-frames, then the slots of the target time
-    R S P    rays, samples on a ray, points (P = R S)
-    coordinate  plane coordinate z of the frustum in [0, 1]; the frustum is the reference camera's
-    maps     what each frame says about itself (`analysis.FrameMaps`); None with the `pyramid` encoder
+V        source frames: K key-frames, then the slots of the target time
+R S P    rays, samples on a ray, points (P = R S)
+coordinate  plane coordinate z of the frustum in [0, 1]; the frustum is the reference camera's
+maps     what each frame says about itself (`analysis.FrameMaps`); None with the `pyramid` encoder
 """
 
 from typing import NamedTuple
@@ -11,10 +11,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.analysis import AnalysisParams, FrameMaps, init_analysis, plane_moments
+from zestjax.analysis import AnalysisParams, init_analysis, plane_moments
 from zestjax.cameras import Camera, resized, scaled
 from zestjax.encoding import SweepViews, Volume, VolumeParams, encode_volume, init_volume
-from zestjax.evidence import half_images, pooled
+from zestjax.evidence import cell_colours, half_images, pooled
 from zestjax.fields.conditioning import SourceViews
 from zestjax.fields.dynamic import DynamicParams, init_dynamic
 from zestjax.fields.static import StaticParams, init_static
@@ -113,6 +113,11 @@ def init_params(key, config):
     )
 
 
+def cells_of(size):
+    """Cells that cover `size` pixels: half-resolution pixels, made even, in pairs."""
+    return (size + 3) // 4
+
+
 def split_maps(maps, count):
     """`FrameMaps` of V frames into those of the first `count` and the rest."""
     return jax.tree.map(lambda x: x[:count], maps), jax.tree.map(lambda x: x[count:], maps)
@@ -129,9 +134,9 @@ def _sweep_views(params, frames, maps, near, far, config):
         colours = frames.images[:, ::4, ::4]
         tables = jnp.concatenate([features, colours], axis=-1)
         return SweepViews(tables, scaled(frames.cameras, 0.25, 0.25), frames.valid)
-    colours = pooled(half_images(frames.images), 2)
-    parts = [maps.features, colours]
+    parts = [maps.features, cell_colours(half_images(frames.images))]
     if config.trust:
+        maps = jax.lax.stop_gradient(maps) if config.hold_trust else maps
         moving = pooled(jax.nn.sigmoid(maps.moving_logits)[..., None], 2)
         depth = _inverse_depth(maps.coordinate, near, far)
         parts += [moving, depth[..., None], (maps.tolerance * (1 / near - 1 / far))[..., None]]
@@ -166,7 +171,7 @@ def reference_frustum(inputs, config):
     if config.encoder == "pyramid":
         camera, size = scaled(camera, 0.25, 0.25), (-(-image[0] // 4), -(-image[1] // 4))
     else:
-        camera, size = resized(camera, 0.25, 0.25), tuple(-(-(-(-n // 2)) // 2) for n in image)
+        camera, size = resized(camera, 0.25, 0.25), tuple(cells_of(n) for n in image)
     return Frustum(camera, inputs.near, inputs.far, *size)
 
 
@@ -174,6 +179,43 @@ def _guides(volumes):
     """(G, h, w) coordinates of the surfaces that each volume believes in."""
     moments = [plane_moments(jnp.moveaxis(v.logits, 0, -1))[0] for v in volumes if v is not None]
     return jax.lax.stop_gradient(jnp.stack(moments))
+
+
+def volumes(params, inputs, maps, *, config):
+    """The geometry and the motion `Volume` of one target, each None where the preset has none; see `encode`.
+
+    Source: ZeST-NeRF eq. 2, eq. 3.
+    """
+    near, far = inputs.near, inputs.far
+    frustum = reference_frustum(inputs, config)
+    depths = plane_depths(near, far, config.planes, spacing=config.spacing)
+    of_key, of_slots = (None, None) if maps is None else split_maps(maps, inputs.key.images.shape[0])
+
+    def volume(part, frames, maps, slots):
+        return encode_volume(
+            part, _sweep_views(part, frames, maps, near, far, config), frustum.camera,
+            (frustum.height, frustum.width), depths, slots=slots,
+            colours="all" if config.conditioning == "concatenated" else "mean",
+            trusted=config.encoder == "frames" and config.trust,
+        )  # fmt: skip
+
+    geometry = volume(params.geometry, inputs.key, of_key, False) if config.geometry else None
+    motion = volume(params.motion, inputs.slots, of_slots, True) if config.motion and config.dynamic else None
+    return geometry, motion
+
+
+def assemble(inputs, maps, encoded, *, config):
+    """`Encoding` of `volumes`' result: adds the tables that rays read and the guides, none of which is learned."""
+    geometry, motion = encoded
+    of_key, of_slots = (None, None) if maps is None else split_maps(maps, inputs.key.images.shape[0])
+    views = lambda frames, maps: _source_views(frames, maps, inputs.time, inputs.near, inputs.far, config)
+    guided = config.sampling == "guided" and (geometry is not None or motion is not None)
+    return Encoding(
+        geometry, motion,
+        None if geometry is None else views(inputs.key, of_key),
+        None if motion is None else views(inputs.slots, of_slots),
+        reference_frustum(inputs, config), _guides(encoded) if guided else None,
+    )  # fmt: skip
 
 
 def encode(params, inputs, maps, *, config):
@@ -188,27 +230,4 @@ def encode(params, inputs, maps, *, config):
     Returns:
       `Encoding`.
     """
-    near, far = inputs.near, inputs.far
-    frustum = reference_frustum(inputs, config)
-    depths = plane_depths(near, far, config.planes, spacing=config.spacing)
-    of_key, of_slots = (None, None) if maps is None else split_maps(maps, inputs.key.images.shape[0])
-    motion = config.motion and config.dynamic
-
-    def volume(part, frames, maps, slots):
-        return encode_volume(
-            part, _sweep_views(part, frames, maps, near, far, config), frustum.camera,
-            (frustum.height, frustum.width), depths, slots=slots,
-            colours="all" if config.conditioning == "concatenated" else "mean",
-            trusted=config.encoder == "frames" and config.trust,
-        )  # fmt: skip
-
-    geometry = volume(params.geometry, inputs.key, of_key, False) if config.geometry else None
-    moving = volume(params.motion, inputs.slots, of_slots, True) if motion else None
-    views = lambda frames, maps: _source_views(frames, maps, inputs.time, near, far, config)
-    guided = config.sampling == "guided" and (config.geometry or motion)
-    return Encoding(
-        geometry, moving,
-        views(inputs.key, of_key) if config.geometry else None,
-        views(inputs.slots, of_slots) if motion else None,
-        frustum, _guides((geometry, moving)) if guided else None,
-    )  # fmt: skip
+    return assemble(inputs, maps, volumes(params, inputs, maps, config=config), config=config)

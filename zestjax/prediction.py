@@ -1,9 +1,9 @@
 """Rays through the encoded scene: samples, fields, pixels.
 
-    R S      rays and samples on a ray; P = R S points, ray by ray
-    coords   (R, S, 3) in the frustum of the volumes, z in [0, 1]
-    lengths  (R, S) what a sample stands for: with guided sampling one plane, so that densities are per plane;
-             with regular sampling its interval, world units
+R S      rays and samples on a ray; P = R S points, ray by ray
+coords   (R, S, 3) in the frustum of the volumes, z in [0, 1]
+lengths  (R, S) what a sample stands for: with guided sampling one plane, so that densities are per plane;
+         with regular sampling its interval, world units
 """
 
 from typing import NamedTuple
@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.encoding import Volume
 from zestjax.fields.conditioning import parallax, sample_views
 from zestjax.fields.dynamic import DynamicSample, dynamic_field, dynamic_views, early_flow
 from zestjax.fields.static import static_field, static_views
@@ -114,13 +113,10 @@ def march(encoding, camera, near, far, pixels, *, config, jitter=None):
 
 
 def look_up(volume, coords):
-    """(P, channels) of a `Volume` at frustum coordinates (P, 3), with the surface's probability if it has logits."""
+    """(P, channels) of a `Volume`'s cells at frustum coordinates (P, 3); no channels without a volume."""
     if volume is None:
         return jnp.zeros((coords.shape[0], 0), coords.dtype)
-    cells = volume.cells
-    if volume.logits is not None:
-        cells = jnp.concatenate([cells, jax.nn.softmax(volume.logits, axis=0)[..., None]], axis=-1)
-    return trilinear(cells, cells_from_frustum(coords, *cells.shape[:3]))
+    return trilinear(volume.cells, cells_from_frustum(coords, *volume.cells.shape[:3]))
 
 
 def _flat(x):
@@ -144,7 +140,9 @@ def query_static(params, encoding, marched, *, config):
 def _directions(marched, config):
     encoded = positional_encoding(marched.directions, levels=config.view_levels)
     samples = marched.depths.shape[1]
-    return jnp.broadcast_to(encoded[:, None], (encoded.shape[0], samples, encoded.shape[1])).reshape(-1, encoded.shape[1])
+    return jnp.broadcast_to(encoded[:, None], (encoded.shape[0], samples, encoded.shape[1])).reshape(
+        -1, encoded.shape[1]
+    )
 
 
 def query_dynamic(params, encoding, coords, directions, time, duration, *, config):
@@ -168,7 +166,8 @@ def query_dynamic(params, encoding, coords, directions, time, duration, *, confi
             early = early_flow(params.dynamic, point, volume, reach=reach)
             times = encoding.slots.times[:, None, None]
             step = jnp.where(times > 0, early[None, :, :3], early[None, :, 3:]) * jnp.abs(times)
-            samples = sample_views(encoding.slots, world(coords[None] + step))
+            # Where to look is learned from the flow's own losses: no gradient through the gathers.
+            samples = sample_views(encoding.slots, jax.lax.stop_gradient(world(coords[None] + step)))
             views = dynamic_views(samples, encoding.slots.times)
         else:
             samples = sample_views(encoding.slots, world(coords)[None])
@@ -205,7 +204,13 @@ def render_rays(params, encoding, inputs, pixels, *, config, jitter=None):
     if params.dynamic is None:
         return _static_prediction(static, marched)
     moving = query_dynamic(
-        params, encoding, _flat(marched.coords), _directions(marched, config), inputs.time, inputs.duration, config=config
+        params,
+        encoding,
+        _flat(marched.coords),
+        _directions(marched, config),
+        inputs.time,
+        inputs.duration,
+        config=config,
     )
     moving = jax.tree.map(grid, moving)
     dynamic = FieldSamples(moving.density, moving.colour)

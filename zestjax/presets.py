@@ -19,7 +19,8 @@ class Config:
     key_frames, key_frame_choice: how many, and `nearest` to the target camera or `spread` over the video.
     slots: neighbours of the target time. reference: camera of the volumes, `target` or `key_frame`.
     geometry, motion: the two volumes; dynamic: the dynamic field (without it a scene is static and nothing of the
-      dynamic branch is compiled). trust: source views are tested before they count.
+      dynamic branch is compiled). trust: source views are tested before they count;
+      hold_trust: the frames' own maps learn from their own losses alone, which halves the sweep's cost.
     sampling: `guided` by the volumes' depth modes, or `regular`; samples: per ray, of `regular`.
     head: `blend` of the views' colours or `direct`. blend: `opacity` or `density` form of the two fields' sum.
     """
@@ -30,8 +31,8 @@ class Config:
     planes: int = 32
     spacing: str = "inverse"
     encoder: str = "frames"
-    features: int = 8
-    frame_widths: tuple = (48, 64, 96)
+    features: int = 0
+    frame_widths: tuple = (32, 48, 64)
     volume_widths: tuple = (8, 16, 32)
     key_frames: int = 8
     key_frame_choice: str = "nearest"
@@ -41,6 +42,7 @@ class Config:
     motion: bool = True
     dynamic: bool = True
     trust: bool = True
+    hold_trust: bool = True
     field_width: int = 48
     field_depth: int = 3
     point_levels: int = 2
@@ -50,8 +52,8 @@ class Config:
     head: str = "blend"
     conditioning: str = "pooled"
     blend: str = "opacity"
-    crop_rows: int = 32
-    ray_blocks: int = 8
+    crop_rows: int = 16
+    ray_blocks: int = 4
 
     def __post_init__(self):
         check_option(
@@ -69,7 +71,7 @@ class Config:
 
 PRESETS = {
     "tiny": Config(
-        "tiny", height=32, width=48, planes=8, features=4, frame_widths=(8, 12), volume_widths=(4, 8),
+        "tiny", height=32, width=48, planes=8, frame_widths=(8, 12), volume_widths=(4, 8),
         key_frames=4, field_width=16, field_depth=2, crop_rows=8, ray_blocks=2,
     ),
     "small": Config("small"),

@@ -1,8 +1,8 @@
 """Which frames of a video serve a target: host-side integer choices, made before anything is traced.
 
-    N          frames of the video; a frame's time is its index
-    positions  (N, 3) optical centres, world units
-    valid      1.0 where the slot holds a frame, 0.0 where the video has none
+N          frames of the video; a frame's time is its index
+positions  (N, 3) optical centres, world units
+valid      1.0 where the slot holds a frame, 0.0 where the video has none
 """
 
 from typing import NamedTuple

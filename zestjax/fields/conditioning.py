@@ -1,9 +1,9 @@
 """What the source views say about a point: their colours, and whether each can be trusted there.
 
-    V        source views (key-frames, or the neighbours of a time)
-    P        points
-    gap      how far a view's own surface lies in front of the point, in its tolerances: > 0 the point is hidden,
-             about 0 it is that surface, < 0 the view looks through it
+V        source views (key-frames, or the neighbours of a time)
+P        points
+gap      how far a view's own surface lies in front of the point, in its tolerances: > 0 the point is hidden,
+         about 0 it is that surface, < 0 the view looks through it
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class SourceViews(NamedTuple):
 
 
 class ViewSamples(NamedTuple):
-    """colour: (V, P, 3), 0 where not visible. visible: (V, P) 1 or 0. moving: (V, P) in [0, 1]. gap: (V, P) in
+    """colour: (V, 3, P), 0 where not visible. visible: (V, P) 1 or 0. moving: (V, P) in [0, 1]. gap: (V, P) in
     [-3, 3]. The last two are 0 of views without trust maps."""
 
     colour: jax.Array
@@ -62,13 +62,14 @@ def sample_views(views, points):
     seen = cells.inside & front & (views.valid[:, None] > 0)
     first = cells.first + (jnp.arange(count, dtype=jnp.int32) * (height * width))[:, None]
     corners = gather_corners(views.tables.reshape(-1, channels), first, corner_offsets(height, width))
-    values = jnp.where(seen[..., None], interpolate(corners, cells.across, cells.down), 0)
+    values = jnp.moveaxis(interpolate(corners, cells.across, cells.down), -1, 1)
+    values = jnp.where(seen[:, None], values, 0)
     visible = seen.astype(values.dtype)
     if channels == 3:
         return ViewSamples(values, visible, jnp.zeros_like(visible), jnp.zeros_like(visible))
-    surface, tolerance = values[..., 4], jnp.where(seen, values[..., 5], 1)
+    surface, tolerance = values[:, 4], jnp.where(seen, values[:, 5], 1)
     gap = jnp.clip((surface - 1 / jnp.where(seen, depth, 1)) / tolerance, -GAP_LIMIT, GAP_LIMIT)
-    return ViewSamples(values[..., :3], visible, values[..., 3], jnp.where(seen, gap, 0))
+    return ViewSamples(values[:, :3], visible, values[:, 3], jnp.where(seen, gap, 0))
 
 
 def hidden(gap):
@@ -82,13 +83,14 @@ def on_surface(gap):
 
 
 def over_views(weights, values):
-    """Weighted mean over views: (V, P), (V, P, C) -> (P, C); 0 where all weights are 0.
+    """Weighted mean over views: (V, P), (V, C, P) -> (C, P); 0 where all weights are 0.
 
     Written as a sum of products: sums over a leading axis are slow on a CPU.
     """
-    total = sum(weights[v] for v in range(weights.shape[0]))
-    summed = sum(weights[v][:, None] * values[v] for v in range(weights.shape[0]))
-    return safe_divide(summed, total[:, None])
+    views = range(weights.shape[0])
+    total = sum(weights[v] for v in views)
+    summed = sum(weights[v][None] * values[v] for v in views)
+    return jax.lax.optimization_barrier(safe_divide(summed, total[None]))
 
 
 def parallax(cameras, points, points_beyond):

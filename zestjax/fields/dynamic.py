@@ -1,7 +1,7 @@
 """The dynamic field: density, colour, scene flow and confidence of a point at a time.
 
-    P  points   V  slots (neighbours of the time)   C  channels of the motion volume   Q  encoded direction
-    flow  offsets in coordinates of the target's frustum, forward (t + 1) and backward (t - 1)
+P  points   V  slots (neighbours of the time)   C  channels of the motion volume   Q  encoded direction
+flow  offsets in coordinates of the target's frustum, forward (t + 1) and backward (t - 1)
 """
 
 from typing import NamedTuple
@@ -22,6 +22,7 @@ from zestjax.fields.trunk import (
     init_trunk,
     init_view_head,
     lifted,
+    pooled_views,
     trunk,
     view_scores,
 )
@@ -85,7 +86,7 @@ def early_flow(params, point, volume, *, reach):
 
 
 class DynamicViews(NamedTuple):
-    """Slots at points. features: (V, P, U). weights: (V, P) trust. summary: (P, SUMMARIES + 2 V)."""
+    """Slots at points. features: (V, U, P). weights: (V, P) trust. summary: (P, SUMMARIES + 2 V)."""
 
     features: jax.Array
     weights: jax.Array
@@ -98,19 +99,16 @@ def dynamic_views(samples, times):
     support = samples.visible * samples.moving * agree
     weights = support + 0.02 * samples.visible * (1 - behind)
     deviation = samples.colour - over_views(weights, samples.colour)[None]
-    size = jnp.sum(jnp.abs(deviation), axis=-1)
+    size = jnp.sum(jnp.abs(deviation), axis=1)
     through = samples.visible * jnp.square(jnp.minimum(samples.gap, 0) / 3)
-    near = jnp.exp(-jnp.abs(times))[:, None]
-    sided = jnp.tanh(times)[:, None]
-    wide = lambda x: jnp.broadcast_to(x, size.shape)
+    wide = lambda x: jnp.broadcast_to(x[:, None], size.shape)
     scalars = [
         size, samples.visible, samples.moving, agree, behind, through, support, samples.gap / 3,
-        samples.moving * through, wide(near), wide(sided),
+        samples.moving * through, wide(jnp.exp(-jnp.abs(times))), wide(jnp.tanh(times)),
     ]  # fmt: skip
-    features = jnp.concatenate([4 * deviation, jnp.stack(scalars, -1)], -1)
-    spread = over_views(weights, jnp.stack([size, agree, through, samples.moving], -1))
-    slots = [support[v] for v in range(size.shape[0])] + [through[v] for v in range(size.shape[0])]
-    return DynamicViews(features, weights, jnp.concatenate([spread, jnp.stack(slots, -1)], -1))
+    features = jnp.concatenate([4 * deviation, jnp.stack(scalars, 1)], 1)
+    spread = over_views(weights, jnp.stack([size, agree, through, samples.moving], 1))
+    return DynamicViews(features, weights, jnp.concatenate([spread, support, through], 0).T)
 
 
 def dynamic_field(params, point, direction, volume, samples, views, *, reach=1.0, early=None, conditioning="multiply"):
@@ -134,8 +132,7 @@ def dynamic_field(params, point, direction, volume, samples, views, *, reach=1.0
     """
     if views is not None:
         lift = lifted(params.views, views.features)
-        pooled = over_views(views.weights + 1e-3, jax.nn.relu(lift))
-        condition = jnp.concatenate([volume, pooled, views.summary], -1)
+        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
     else:
         condition = concatenated(volume, samples)
     state = trunk(params.trunk, point, condition, conditioning=conditioning)

@@ -1,6 +1,6 @@
 """The static field: density, colour and blend of a point that does not move.
 
-    P  points   V  key-frames   C  channels of the geometry volume   Q  encoded direction
+P  points   V  key-frames   C  channels of the geometry volume   Q  encoded direction
 """
 
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from zestjax.fields.trunk import (
     init_trunk,
     init_view_head,
     lifted,
+    pooled_views,
     trunk,
     view_scores,
 )
@@ -67,7 +68,7 @@ def init_static(key, *, n_point, n_direction, n_volume, n_views, width, depth, h
 
 
 class StaticViews(NamedTuple):
-    """Key-frames at points. features: (V, P, U) per view. weights: (V, P) trust. summary: (P, SUMMARIES)."""
+    """Key-frames at points. features: (V, U, P) per view. weights: (V, P) trust. summary: (P, SUMMARIES)."""
 
     features: jax.Array
     weights: jax.Array
@@ -88,22 +89,22 @@ def static_views(samples, shift, times):
     agree, behind = on_surface(samples.gap), hidden_behind(samples.gap)
     weights = samples.visible * (1 - samples.moving) * (1 - behind)
     mean = over_views(weights, samples.colour)
-    deviation = samples.colour - mean[None]
-    size = jnp.sum(jnp.abs(deviation), axis=-1)
+    size = jnp.sum(jnp.abs(samples.colour - mean[None]), axis=1)
     robust = weights * jnp.exp(-jnp.square(size / 0.3)) / (1 + shift)
     second = samples.colour - over_views(robust, samples.colour)[None]
     through = samples.visible * (1 - samples.moving) * jnp.square(jnp.minimum(samples.gap, 0) / 3)
     near = jnp.broadcast_to(jnp.exp(-jnp.abs(times) / 4)[:, None], size.shape)
     scalars = [
-        size, jnp.sum(jnp.abs(second), -1), samples.visible, samples.moving, agree, behind, through,
+        size, jnp.sum(jnp.abs(second), 1), samples.visible, samples.moving, agree, behind, through,
         1 / (1 + shift), 1 / (1 + shift / 4), near,
     ]  # fmt: skip
-    features = jnp.concatenate([4 * second, jnp.stack(scalars, -1)], -1)
-    spread = over_views(weights, jnp.stack([size, agree, through], -1))
+    features = jnp.concatenate([4 * second, jnp.stack(scalars, 1)], 1)
+    spread = over_views(weights, jnp.stack([size, agree, through], 1))
     views = range(size.shape[0])
     total = sum(weights[v] for v in views) / len(views)
     best = sum(weights[v] / (1 + shift[v]) for v in views) / len(views)
-    return StaticViews(features, weights, jnp.concatenate([spread, total[:, None], best[:, None]], -1))
+    summary = jnp.concatenate([spread, total[None], best[None]], 0).T
+    return jax.lax.stop_gradient(StaticViews(features, weights, summary))
 
 
 def static_field(params, point, direction, volume, samples, views, *, conditioning="multiply"):
@@ -125,8 +126,7 @@ def static_field(params, point, direction, volume, samples, views, *, conditioni
     """
     if views is not None:
         lift = lifted(params.views, views.features)
-        pooled = over_views(views.weights + 1e-3, jax.nn.relu(lift))
-        condition = jnp.concatenate([volume, pooled, views.summary], -1)
+        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
     else:
         condition = concatenated(volume, samples)
     state = trunk(params.trunk, point, condition, conditioning=conditioning)
@@ -146,5 +146,5 @@ def concatenated(volume, samples):
     """(P, C + 4 V): volume features, then every view's colour and visibility bit, as the paper conditions."""
     if samples is None:
         return volume if volume.shape[-1] else jnp.ones((volume.shape[0], 1), volume.dtype)
-    per_view = jnp.concatenate([samples.colour, samples.visible[..., None]], axis=-1)
-    return jnp.concatenate([volume, *per_view], axis=-1)
+    per_view = jnp.concatenate([samples.colour, samples.visible[:, None]], axis=1)
+    return jnp.concatenate([volume, per_view.reshape(-1, per_view.shape[-1]).T], axis=-1)

@@ -1,6 +1,6 @@
 """The trunk that both fields share: an MLP whose hidden state is modulated by the conditioning, and the view pooling.
 
-    P  points   F  conditioning features   Q  encoded direction   V  source views   U  channels per view
+P  points   F  conditioning features   Q  encoded direction   V  source views   U  channels per view
 """
 
 from typing import NamedTuple
@@ -80,22 +80,44 @@ def init_view_head(key, n_view, n_hidden, *, width=16):
 
 
 def lifted(params, features):
-    """(V, P, U) -> (V, P, width) before any activation."""
-    return dense(params.lift, features)
+    """(V, U, P) -> V arrays (width, P) before any activation.
+
+    One product per view, the bias as one more row: the gradients are products too, not slow sums.
+    """
+    kernel = jnp.concatenate([params.lift.kernel, params.lift.bias[None]]).T
+    ones = jnp.ones_like(features[0, :1])
+    return [kernel @ jnp.concatenate([view, ones]) for view in features]
 
 
-def view_scores(params, features, hidden):
-    """(V, P) logits with which each view's colour is chosen, from its own lifted features and the point's state."""
-    query = dense(params.query, hidden)
-    return dense(params.score, jax.nn.relu(features + query[None]))[..., 0]
+def pooled_views(lift, weights):
+    """(P, width) weighted mean over views of their activated features; weights (V, P), every view at least a little."""
+    weights = weights + 1e-3
+    total = sum(weights[v] for v in range(len(lift)))
+    share = jax.lax.optimization_barrier(weights / total[None])
+    return sum(share[v][None] * jax.nn.relu(view) for v, view in enumerate(lift)).T
+
+
+def view_scores(params, lift, hidden):
+    """(V, P) logits with which each view's colour is chosen.
+
+    Args:
+      params: `ViewHead`.
+      lift: V arrays (width, P) from `lifted`.
+      hidden: (P, n) state of the points.
+    """
+    query = dense(params.query, hidden).T
+    kernel = params.score.kernel.T
+    return jnp.concatenate([kernel @ jax.nn.relu(view + query) for view in lift]) + params.score.bias[0]
 
 
 def blend_of_views(scores, prior, visible, colour):
     """Softmax over the views that see a point of their colours.
 
     Args:
-      scores: (V, P) logits. prior: (V, P) >= 0 trust that multiplies the softmax. visible: (V, P) 1 or 0.
-      colour: (V, P, 3).
+      scores: (V, P) logits.
+      prior: (V, P) >= 0 trust that multiplies the softmax.
+      visible: (V, P) 1 or 0.
+      colour: (V, 3, P).
 
     Returns:
       (P, 3); 0 where no view sees the point.
@@ -104,8 +126,8 @@ def blend_of_views(scores, prior, visible, colour):
     weights = jnp.exp(scores) * (prior + 1e-4) * visible
     views = range(weights.shape[0])
     total = sum(weights[v] for v in views)
-    mean = sum(weights[v][:, None] * colour[v] for v in views)
-    return mean / jnp.maximum(total, 1e-9)[:, None]
+    mean = sum(weights[v][None] * colour[v] for v in views)
+    return (mean / jnp.maximum(total, 1e-9)[None]).T
 
 
 def init_colour_head(key, n_hidden, n_view):

@@ -1,0 +1,107 @@
+"""From a video on the host to the arrays of one target: frames chosen, evidence found, everything in fixed shapes.
+
+N        frames of the video
+exclude  frames that must serve nothing: not as key-frame or slot, not in another frame's evidence
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zestjax.cameras import Camera
+from zestjax.evidence import Evidence, Sources, frame_evidence, half_images
+from zestjax.model import Frames, Inputs
+from zestjax.selection import key_frames, slots
+
+EVIDENCE_SOURCES = 8
+
+
+def positions(cameras):
+    """(N, 3) optical centres of host cameras, numpy."""
+    pose = np.asarray(cameras.camera_from_world)
+    return -np.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3])
+
+
+def taken(cameras, frames):
+    """`Camera` of the chosen frames."""
+    return Camera(*(np.asarray(leaf)[frames] for leaf in cameras))
+
+
+@functools.partial(jax.jit, static_argnames=("planes",))
+def _evidence(image, camera, sources, neighbours, near, far, *, planes):
+    found = frame_evidence(image, camera, sources, neighbours, near, far, planes=planes)
+    return Evidence(*(jnp.round(255 * jnp.clip(x, 0, 1)).astype(jnp.uint8) for x in found))
+
+
+@jax.jit
+def halved(images):
+    """(N, H, W, 3) uint8 or float images as float32 at half resolution."""
+    images = images.astype(jnp.float32) / 255 if images.dtype == jnp.uint8 else images
+    return half_images(images)
+
+
+def video_evidence(half, cameras, near, far, *, planes, frames=None, exclude=()):
+    """`Evidence` of frames of a video, quantised to uint8 (1/255 of the truncation), on the host.
+
+    Args:
+      half: (N, 2h, 2w, 3) from `halved`.
+      cameras: `Camera` (N, ...) on the host, of full-size images.
+      near, far: world units. planes: E.
+      frames: which frames, all by default. exclude: see the header.
+
+    Returns:
+      `Evidence` of uint8 numpy arrays, leading axis `frames`.
+    """
+    count = len(half)
+    places = positions(cameras)
+    found = []
+    for i in range(count) if frames is None else frames:
+        others = {i, *exclude}
+        chosen = key_frames(places, EVIDENCE_SOURCES, target=places[i], time=i, exclude=others)
+        around = slots(count, i, offsets=(-1, 1), exclude=others)
+        pack = lambda c: Sources(half[c.frames], taken(cameras, c.frames), c.valid)
+        found.append(
+            _evidence(
+                half[i], taken(cameras, i), pack(chosen), pack(around), np.float32(near), np.float32(far), planes=planes
+            )
+        )
+    return jax.tree.map(lambda *rows: np.stack([np.asarray(r) for r in rows]), *found)
+
+
+def dequantised(evidence):
+    """uint8 `Evidence` as float32 in [0, 1]."""
+    return jax.tree.map(lambda x: x.astype(jnp.float32) / 255, evidence)
+
+
+def target_inputs(images, cameras, near, far, camera, time, *, config, exclude=()):
+    """`Inputs` of a target, and which frames they hold.
+
+    Args:
+      images: (N, H, W, 3) uint8 or float32, host or device. cameras: `Camera` (N, ...) on the host.
+      near, far: world units. camera: the target's `Camera`. time: int frame time.
+      config: `presets.Config`.
+      exclude: see the header.
+
+    Returns:
+      (`Inputs`, (K + M,) int frames).
+    """
+    count = len(images)
+    centre = positions(Camera(*(np.asarray(x)[None] for x in camera)))[0]
+    chosen = key_frames(
+        positions(cameras), config.key_frames, target=centre, time=time, choice=config.key_frame_choice, exclude=exclude
+    )
+    around = slots(count, time, offsets=config.slots, exclude=exclude)
+
+    def pack(c):
+        shown = jnp.asarray(images[c.frames])
+        shown = shown.astype(jnp.float32) / 255 if shown.dtype == jnp.uint8 else shown
+        return Frames(shown, taken(cameras, c.frames), c.valid, c.frames.astype(np.float32))
+
+    inputs = Inputs(
+        pack(chosen), pack(around)._replace(times=np.float32(time) + np.asarray(config.slots, np.float32)),
+        Camera(*(jnp.asarray(x, jnp.float32) for x in camera)),
+        np.float32(time), np.float32(count), np.float32(near), np.float32(far),
+    )  # fmt: skip
+    return inputs, np.concatenate([chosen.frames, around.frames])

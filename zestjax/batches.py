@@ -1,0 +1,193 @@
+"""Batches: one target of a simulated clip, with everything that is known about it.
+
+R        rays of the crop: config.crop_rows whole rows of the target
+V        source frames, key-frames then slots
+h w      cells, a quarter of the image
+planes   fractional plane index of a true depth, 0 at near
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from zestjax.assembly import halved, target_inputs, video_evidence
+from zestjax.cameras import Camera
+from zestjax.evidence import Evidence
+from zestjax.model import Inputs, cells_of
+from zestjax.simulate.clips import Clip
+
+HOLES = 3
+
+
+class Truth(NamedTuple):
+    """What a crop should show. pixels: (R, 2). colour, static: (R, 3). static_valid, moving: (R,) 1 or 0.
+    depth: (R,) world units. flow: (R, 2, 3) world, to the next and previous time. flow_valid: (R,) 1 or 0."""
+
+    pixels: jax.Array
+    colour: jax.Array
+    static: jax.Array
+    static_valid: jax.Array
+    moving: jax.Array
+    depth: jax.Array
+    flow: jax.Array
+    flow_valid: jax.Array
+
+
+class Batch(NamedTuple):
+    """inputs: `Inputs`. evidence: `Evidence` (V, ...) uint8, or None. truth: `Truth` of the crop.
+    static_planes, moving_planes: (h, w) of the target view at cell centres, with their validities.
+    frame_planes: (V, h, w). frame_moving: (V, 2h, 2w). frame_valid: (V,)."""
+
+    inputs: Inputs
+    evidence: Evidence | None
+    truth: Truth
+    static_planes: jax.Array
+    static_planes_valid: jax.Array
+    moving_planes: jax.Array
+    moving_planes_valid: jax.Array
+    frame_planes: jax.Array
+    frame_moving: jax.Array
+    frame_valid: jax.Array
+
+
+class PreparedClip(NamedTuple):
+    """A `simulate.clips.Clip` with its evidence; holes: frames that the video lacks, targets of the strict kind;
+    hidden: frames that serve nothing and are no targets either."""
+
+    clip: Clip
+    evidence: Evidence | None
+    holes: tuple
+    hidden: tuple = ()
+
+
+def prepare_clip(key, clip, config):
+    """Evidence of a clip, computed once; the frames in `holes` serve no other frame, as if the video lacked them.
+
+    Args:
+      key: draws the holes. clip: `simulate.clips.Clip`. config: `presets.Config`.
+    """
+    count = len(clip.images)
+    holes = tuple(int(i) for i in jax.random.choice(key, count, (min(HOLES, count // 5),), replace=False))
+    if config.encoder != "frames":
+        return PreparedClip(clip, None, holes)
+    cameras = Camera(clip.intrinsics, clip.camera_from_world)
+    half = halved(clip.images)
+    evidence = video_evidence(half, cameras, clip.near, clip.far, planes=config.planes, exclude=holes)
+    return PreparedClip(clip, evidence, holes)
+
+
+def clip_from_arrays(arrays):
+    """`Clip` of a stored clip's arrays by name.
+
+    Raises:
+      ValueError: naming the fields that are missing.
+    """
+    missing = [name for name in Clip._fields if name not in arrays]
+    if missing:
+        raise ValueError(
+            f"clip_from_arrays: the stored clip lacks {', '.join(missing)}; delete it, it is rendered again."
+        )
+    return Clip(**{name: arrays[name] for name in Clip._fields})
+
+
+def _planes(depth, near, far, config):
+    depth = np.maximum(depth, 1e-6)
+    share = (
+        (1 / near - 1 / depth) / (1 / near - 1 / far) if config.spacing == "inverse" else (depth - near) / (far - near)
+    )
+    return (share * (config.planes - 1)).astype(np.float32)
+
+
+def _cells(x):
+    """(..., H, W) maps at the cells' centres, (..., h, w) with h the cells of the evidence."""
+    height, width = x.shape[-2:]
+    size = [cells_of(n) for n in (height, width)]
+    rows, columns = (np.minimum(4 * np.arange(s) + 2, n - 1) for s, n in zip(size, (height, width), strict=True))
+    return x[..., rows[:, None], columns]
+
+
+def _half_mask(moving, cells):
+    """(V, H, W) bool to the share of moving pixels at half resolution, (V, 2h, 2w)."""
+    count, height, width = moving.shape
+    padded = np.pad(moving, [(0, 0), (0, 4 * cells[0] - height), (0, 4 * cells[1] - width)], mode="edge")
+    return padded.reshape(count, 2 * cells[0], 2, 2 * cells[1], 2).mean((2, 4), dtype=np.float32)
+
+
+def _target_views(clip, holes):
+    """Every target of a clip: (kind, index, time); kind `view` is another camera, `frame` one of the holes."""
+    return [("view", i, int(t)) for i, t in enumerate(clip.target_time)] + [("frame", i, i) for i in holes]
+
+
+def batch_from_clip(key, prepared, config):
+    """One target of a clip: which, and which rows of it, is drawn from `key`.
+
+    A target at the time of a hole has no slot at its own time; a hole is itself a target that no input has seen.
+
+    Args:
+      key: random key. prepared: `PreparedClip`. config: `presets.Config`.
+
+    Returns:
+      `Batch` of host arrays.
+    """
+    clip, holes = prepared.clip, prepared.holes
+    draw = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
+    views = _target_views(clip, holes)
+    kind, index, time = views[draw.integers(len(views))]
+    cameras = Camera(clip.intrinsics, clip.camera_from_world)
+    shown = _shown(clip, kind, index)
+    inputs, frames = target_inputs(
+        clip.images,
+        cameras,
+        clip.near,
+        clip.far,
+        shown["camera"],
+        time,
+        config=config,
+        exclude=(*holes, *prepared.hidden),
+    )
+    cells = _cells(clip.depth[:1]).shape[1:]
+    planes = lambda depth: _cells(_planes(depth, clip.near, clip.far, config))
+    moving = _cells(shown["moving"])
+    return Batch(
+        inputs, None if prepared.evidence is None else jax.tree.map(lambda x: x[frames], prepared.evidence),
+        _crop(shown, draw.integers(0, clip.images.shape[1] - config.crop_rows + 1), config),
+        planes(shown["static_depth"]), _cells(shown["static_valid"]).astype(np.float32),
+        planes(shown["depth"]), moving.astype(np.float32),
+        planes(clip.depth[frames]), _half_mask(clip.moving[frames], cells),
+        np.concatenate([inputs.key.valid, inputs.slots.valid]),
+    )  # fmt: skip
+
+
+def _shown(clip, kind, index):
+    """Everything known about a target, whole image."""
+    if kind == "view":
+        camera = Camera(clip.target_intrinsics[index], clip.target_camera_from_world[index])
+        return dict(
+            camera=camera, image=clip.target_images[index], depth=clip.target_depth[index],
+            moving=clip.target_moving[index], static=clip.target_static_images[index],
+            static_depth=clip.target_static_depth[index], static_valid=clip.target_static_valid[index],
+            flow=clip.target_scene_flow[index], flow_known=True,
+        )  # fmt: skip
+    camera = Camera(clip.intrinsics[index], clip.camera_from_world[index])
+    still = ~clip.moving[index]
+    return dict(
+        camera=camera, image=clip.images[index], depth=clip.depth[index], moving=clip.moving[index],
+        static=clip.images[index], static_depth=clip.depth[index], static_valid=still,
+        flow=np.zeros((2, *still.shape, 3), np.float16), flow_known=False,
+    )  # fmt: skip
+
+
+def _crop(shown, first, config):
+    rows = slice(first, first + config.crop_rows)
+    width = shown["depth"].shape[1]
+    v, u = np.meshgrid(np.arange(first, first + config.crop_rows), np.arange(width), indexing="ij")
+    flat = lambda x: x[rows].reshape(-1, *x.shape[2:])
+    colour = lambda x: flat(x).astype(np.float32) / 255
+    moving = flat(shown["moving"]).astype(np.float32)
+    return Truth(
+        np.stack([u, v], -1).reshape(-1, 2).astype(np.float32), colour(shown["image"]), colour(shown["static"]),
+        flat(shown["static_valid"]).astype(np.float32), moving, flat(shown["depth"]).astype(np.float32),
+        np.moveaxis(shown["flow"][:, rows], 0, 2).reshape(-1, 2, 3).astype(np.float32),
+        moving * float(shown["flow_known"]),
+    )  # fmt: skip
