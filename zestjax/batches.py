@@ -14,24 +14,11 @@ import numpy as np
 from zestjax.assembly import halved, target_inputs, video_evidence
 from zestjax.cameras import Camera
 from zestjax.evidence import Evidence
+from zestjax.measures import Truth
 from zestjax.model import Inputs, cells_of
 from zestjax.simulate.clips import Clip
 
 HOLES = 3
-
-
-class Truth(NamedTuple):
-    """What a crop should show. pixels: (R, 2). colour, static: (R, 3). static_valid, moving: (R,) 1 or 0.
-    depth: (R,) world units. flow: (R, 2, 3) world, to the next and previous time. flow_valid: (R,) 1 or 0."""
-
-    pixels: jax.Array
-    colour: jax.Array
-    static: jax.Array
-    static_valid: jax.Array
-    moving: jax.Array
-    depth: jax.Array
-    flow: jax.Array
-    flow_valid: jax.Array
 
 
 class Batch(NamedTuple):
@@ -73,7 +60,7 @@ def prepare_clip(key, clip, config):
         return PreparedClip(clip, None, holes)
     cameras = Camera(clip.intrinsics, clip.camera_from_world)
     half = halved(clip.images)
-    evidence = video_evidence(half, cameras, clip.near, clip.far, planes=config.planes, exclude=holes)
+    evidence = video_evidence(half, cameras, clip.near, clip.far, planes=config.evidence_planes, exclude=holes)
     return PreparedClip(clip, evidence, holes)
 
 
@@ -91,12 +78,10 @@ def clip_from_arrays(arrays):
     return Clip(**{name: arrays[name] for name in Clip._fields})
 
 
-def _planes(depth, near, far, config):
-    depth = np.maximum(depth, 1e-6)
-    share = (
-        (1 / near - 1 / depth) / (1 / near - 1 / far) if config.spacing == "inverse" else (depth - near) / (far - near)
-    )
-    return (share * (config.planes - 1)).astype(np.float32)
+def _planes(depth, clip, count, *, spacing="inverse"):
+    near, far, depth = clip.near, clip.far, np.maximum(depth, 1e-6)
+    share = (1 / near - 1 / depth) / (1 / near - 1 / far) if spacing == "inverse" else (depth - near) / (far - near)
+    return (share * (count - 1)).astype(np.float32)
 
 
 def _cells(x):
@@ -147,14 +132,14 @@ def batch_from_clip(key, prepared, config):
         exclude=(*holes, *prepared.hidden),
     )
     cells = _cells(clip.depth[:1]).shape[1:]
-    planes = lambda depth: _cells(_planes(depth, clip.near, clip.far, config))
+    planes = lambda depth: _cells(_planes(depth, clip, config.planes, spacing=config.spacing))
     moving = _cells(shown["moving"])
     return Batch(
         inputs, None if prepared.evidence is None else jax.tree.map(lambda x: x[frames], prepared.evidence),
         _crop(shown, draw.integers(0, clip.images.shape[1] - config.crop_rows + 1), config),
         planes(shown["static_depth"]), _cells(shown["static_valid"]).astype(np.float32),
         planes(shown["depth"]), moving.astype(np.float32),
-        planes(clip.depth[frames]), _half_mask(clip.moving[frames], cells),
+        _cells(_planes(clip.depth[frames], clip, config.evidence_planes)), _half_mask(clip.moving[frames], cells),
         np.concatenate([inputs.key.valid, inputs.slots.valid]),
     )  # fmt: skip
 
@@ -189,5 +174,5 @@ def _crop(shown, first, config):
         np.stack([u, v], -1).reshape(-1, 2).astype(np.float32), colour(shown["image"]), colour(shown["static"]),
         flat(shown["static_valid"]).astype(np.float32), moving, flat(shown["depth"]).astype(np.float32),
         np.moveaxis(shown["flow"][:, rows], 0, 2).reshape(-1, 2, 3).astype(np.float32),
-        moving * float(shown["flow_known"]),
+        moving * float(shown["flow_known"]), np.full(moving.shape, float(shown["flow_known"]), np.float32),
     )  # fmt: skip

@@ -10,11 +10,10 @@ import jax.numpy as jnp
 
 from zestjax.analysis import frame_maps
 from zestjax.assembly import dequantised
-from zestjax.frustum import world_from_frustum
 from zestjax.losses.means import mean_over_valid
 from zestjax.losses.objective import Terms, measured, weighted_sum
-from zestjax.losses.regularisers import blend_entropy_loss
-from zestjax.losses.supervision import depth_cross_entropy_loss, motion_mask_loss
+from zestjax.losses.supervision import depth_cross_entropy_loss
+from zestjax.measures import make_measures
 from zestjax.model import Encoding, assemble, reference_frustum, volumes
 from zestjax.prediction import render_rays
 from zestjax.schedules import cosine
@@ -23,42 +22,8 @@ from zestjax.solve import Adam
 FRAME_WEIGHTS = Terms(
     rec=20.0, static_rec=8.0, b=1e-3, depth_ce=0.1, mask=0.05, flow3d=0.2, frame_ce=0.1, frame_mask=0.1
 )  # the shipped weights' terms, with the simulator's exact answers
-RAY_TERMS = ("rec", "static_rec", "b", "mask", "flow3d")
+RAY_TERMS = ("rec", "static_rec", "mask", "b", "flow3d", "pho", "w", "cyc", "min", "sp", "temp", "geo", "depth")
 SCENE_TERMS = ("depth_ce", "frame_ce", "frame_mask")
-
-
-def _rec(prediction, truth):
-    return mean_over_valid("learn", (prediction.colour - truth.colour) ** 2)
-
-
-def _static_rec(prediction, truth):
-    return mean_over_valid("learn", (prediction.static_colour - truth.static) ** 2, valid=truth.static_valid)
-
-
-def _mask(prediction, truth):
-    return motion_mask_loss(prediction.dynamicness, truth.moving)
-
-
-def _blend(prediction, truth):
-    return blend_entropy_loss(prediction.blend)
-
-
-def make_flow_measure(frustum, config):
-    """Scene flow of the samples at the true surface of moving pixels, as a share of their depth."""
-
-    def flow3d(prediction, truth):
-        marched, dynamic = prediction.marched, prediction.dynamic
-        near_surface = jnp.exp(-jnp.square((marched.depths / truth.depth[:, None] - 1) / 0.05))
-        weight = jax.lax.stop_gradient(near_surface) * truth.flow_valid[:, None]
-        world = lambda c: world_from_frustum(frustum, c, spacing=config.spacing)
-        total = 0.0
-        for step, flow in enumerate((dynamic.flow_forward, dynamic.flow_backward)):
-            moved = world(marched.coords + flow) - marched.points
-            error = jnp.abs(moved - truth.flow[:, None, step]) / truth.depth[:, None, None]
-            total = total + mean_over_valid("learn", jnp.minimum(error, 1.0), valid=weight)
-        return 10 * total / 2
-
-    return flow3d
 
 
 def scene_terms(maps, encoded, batch, weights):
@@ -134,11 +99,9 @@ def train_step(config, *, weights=FRAME_WEIGHTS, solver):
         return (encoded, weighted_sum(terms, _only(weights, known))), (maps, terms)
 
     def rays(params, encoded, tables, inputs, truth):
-        frustum = reference_frustum(inputs, config)
-        encoding = Encoding(*encoded, *tables[:2], frustum, tables[2])
+        encoding = Encoding(*encoded, *tables[:2], reference_frustum(inputs, config), tables[2])
         prediction = render_rays(params, encoding, inputs, truth.pixels, config=config)
-        flow3d = make_flow_measure(frustum, config)
-        measures = Terms(rec=_rec, static_rec=_static_rec, mask=_mask, b=_blend, flow3d=flow3d)
+        measures = make_measures(params, encoding, inputs, config=config)
         terms = measured(measures, prediction, truth, terms_of_rays)
         return weighted_sum(terms, terms_of_rays), terms
 

@@ -103,7 +103,7 @@ def init_params(key, config):
 
     slots = len(config.slots)
     motion = config.motion and config.dynamic
-    analysis = init_analysis(keys[0], planes=config.planes, features=config.features, widths=config.frame_widths)
+    analysis = init_analysis(keys[0], planes=config.evidence_planes, features=config.features, widths=config.frame_widths)
     return ZestParams(
         analysis if frames and (config.geometry or motion) else None,
         volume(keys[1], config.key_frames, False) if config.geometry else None,

@@ -40,7 +40,8 @@ class Marched(NamedTuple):
 class Prediction(NamedTuple):
     """What rays show and the samples behind it; leaves of an absent dynamic field are None.
 
-    colour, static_colour, dynamic_colour: (R, 3). depth: (R,) world units. opacity, dynamicness: (R,) in [0, 1].
+    colour, static_colour, dynamic_colour: (R, 3). depth: (R,) world units; depth_of_dynamic: of the
+    dynamic field alone. opacity, dynamicness: (R,) in [0, 1].
     blend: (R, S) in (0, 1). weights: (R, S) of both fields together. dynamic_weights: (R, S) of the dynamic field
     in the blend. dynamic_alone: (R, S) of the dynamic field by itself. dynamic: `DynamicSample` of (R, S, ...).
     marched: `Marched`.
@@ -50,6 +51,7 @@ class Prediction(NamedTuple):
     static_colour: jax.Array
     dynamic_colour: jax.Array | None
     depth: jax.Array
+    depth_of_dynamic: jax.Array | None
     opacity: jax.Array
     dynamicness: jax.Array
     blend: jax.Array | None
@@ -134,10 +136,11 @@ def query_static(params, encoding, marched, *, config):
             shift = parallax(encoding.key.cameras, points, _flat(marched.beyond)[None])
             views = static_views(samples, shift, encoding.key.times)
     volume = look_up(encoding.geometry, _flat(marched.coords))
-    return static_field(params.static, point, _directions(marched, config), volume, samples, views)
+    return static_field(params.static, point, encoded_directions(marched, config), volume, samples, views)
 
 
-def _directions(marched, config):
+def encoded_directions(marched, config):
+    """(P, Q) encoded viewing direction of each sample."""
     encoded = positional_encoding(marched.directions, levels=config.view_levels)
     samples = marched.depths.shape[1]
     return jnp.broadcast_to(encoded[:, None], (encoded.shape[0], samples, encoded.shape[1])).reshape(
@@ -207,7 +210,7 @@ def render_rays(params, encoding, inputs, pixels, *, config, jitter=None):
         params,
         encoding,
         _flat(marched.coords),
-        _directions(marched, config),
+        encoded_directions(marched, config),
         inputs.time,
         inputs.duration,
         config=config,
@@ -222,7 +225,7 @@ def render_rays(params, encoding, inputs, pixels, *, config, jitter=None):
         colour = colour + (1 - out.opacity)[:, None] * behind
         static_colour = static_colour + (1 - jnp.sum(out.static_weights, -1))[:, None] * behind
     return Prediction(
-        colour, static_colour, out.dynamic_colour, out.depth, out.opacity, out.dynamicness, blend,
+        colour, static_colour, out.dynamic_colour, out.depth, out.dynamic_depth, out.opacity, out.dynamicness, blend,
         out.weights.static + out.weights.dynamic, out.weights.dynamic, out.dynamic_weights, moving, marched,
     )  # fmt: skip
 
@@ -234,4 +237,4 @@ def _static_prediction(static, marched):
     colour = shown.values["colour"] + (1 - opacity)[:, None] * last_resort(static)
     depth = shown.values["depth"][:, 0] / jnp.maximum(opacity, 1e-6)
     none = jnp.zeros_like(opacity)
-    return Prediction(colour, colour, None, depth, opacity, none, None, weights, None, None, None, marched)
+    return Prediction(colour, colour, None, depth, None, opacity, none, None, weights, None, None, None, marched)

@@ -14,6 +14,7 @@ class Config:
     """What the model computes; hashable, so that it can be a static argument of a compiled function.
 
     height, width: size the preset was made for, pixels. planes: depth planes of a volume.
+    evidence_planes: planes on which a frame's own depth is found; the frames' encoder is made for them.
     encoder: `frames` (an encoder of each frame that also finds its depth and moving pixels, see `analysis`) or
       `pyramid` (the paper's 2-D feature net). features, volume_widths, frame_widths: channels.
     key_frames, key_frame_choice: how many, and `nearest` to the target camera or `spread` over the video.
@@ -29,6 +30,7 @@ class Config:
     height: int = 144
     width: int = 256
     planes: int = 32
+    evidence_planes: int = 32
     spacing: str = "inverse"
     encoder: str = "frames"
     features: int = 0
@@ -71,7 +73,7 @@ class Config:
 
 PRESETS = {
     "tiny": Config(
-        "tiny", height=32, width=48, planes=8, frame_widths=(8, 12), volume_widths=(4, 8),
+        "tiny", height=32, width=48, planes=8, evidence_planes=8, frame_widths=(8, 12), volume_widths=(4, 8),
         key_frames=4, field_width=16, field_depth=2, crop_rows=8, ray_blocks=2,
     ),
     "small": Config("small"),

@@ -108,7 +108,7 @@ def frame_batches(video, config, *, seed, exclude=()):
         if config.encoder == "frames":
             hidden = {*holes, *exclude}
             evidence = video_evidence(
-                half, video.cameras, video.near, video.far, planes=config.planes, exclude=tuple(hidden)
+                half, video.cameras, video.near, video.far, planes=config.evidence_planes, exclude=tuple(hidden)
             )  # fmt: skip
         return PreparedClip(clip, evidence, holes, tuple(exclude))
 

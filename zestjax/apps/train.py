@@ -126,7 +126,7 @@ class _SimulatedBatches:
     """Batches of the sliding window of simulated clips; a context that ends their producer."""
 
     def __init__(self, config, options):
-        planes = config.planes if config.encoder == "frames" else 0
+        planes = config.evidence_planes if config.encoder == "frames" else 0
         spec = ClipSpec(options.seed, config.height, config.width, planes=planes)
         folder = clip_folder(spec, root=options.clips)
         self.config, self.seed, self.count = config, options.seed, options.clip_count

@@ -1,0 +1,199 @@
+"""What each loss term measures on a block of rays: `Terms` of functions, not traced where the weight is absent.
+
+R S        rays of a block, samples on a ray
+direction  +1 forward (to t + 1), -1 backward; order (forward, backward) on a leading axis of 2
+warped     the dynamic field at x + flow, one frame away (two with `chain`), composited on the ray of t
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from zestjax.cameras import project, unproject
+from zestjax.flow import optical_flow, world_flow
+from zestjax.frustum import world_from_frustum
+from zestjax.losses.means import mean_over_valid
+from zestjax.losses.objective import Terms
+from zestjax.losses.photometric import photometric_loss, reconstruction_loss
+from zestjax.losses.priors import depth_loss, geometric_loss
+from zestjax.losses.regularisers import blend_entropy_loss, disocclusion_loss
+from zestjax.losses.scene_flow import cycle_loss, minimum_flow_loss, spatial_smoothness_loss, temporal_loss
+from zestjax.losses.supervision import motion_mask_loss
+from zestjax.prediction import encoded_directions, query_dynamic
+from zestjax.rendering import composite, confidence_map, weights_from_density
+
+DIRECTIONS = (1, -1)
+NEAR_SURFACE = 0.05  # share of the depth within which a sample counts as on the true surface
+
+
+class Truth(NamedTuple):
+    """What a crop should show. pixels: (R, 2). colour, static: (R, 3). static_valid, moving: (R,) 1 or 0.
+    depth: (R,) world units. flow: (R, 2, 3) world, to the next and previous time. flow_valid: (R,) 1 or 0, the flow is
+    known and not nothing. known: (R,) 1 or 0, depth and flow are known at all."""
+
+    pixels: jax.Array
+    colour: jax.Array
+    static: jax.Array
+    static_valid: jax.Array
+    moving: jax.Array
+    depth: jax.Array
+    flow: jax.Array
+    flow_valid: jax.Array
+    known: jax.Array
+
+
+class Warped(NamedTuple):
+    """Of each path: colour (M, R, 3), confidence (M, R), valid (M,), and of the one-frame paths the flow there and
+    back, world units, (2, R, S, 3) each."""
+
+    colour: jax.Array
+    confidence: jax.Array
+    valid: jax.Array
+    there: jax.Array
+    back: jax.Array
+
+
+def slot_valid(slots, offset):
+    """() 1 if the slot at this offset from the target time is among the slots and filled, else 0."""
+    return jnp.max(jnp.where(slots.times == offset, slots.valid, 0))
+
+
+def warped(params, encoding, inputs, prediction, *, config, chain=False):
+    """The dynamic field followed to the neighbouring times.
+
+    Args:
+      params: `model.ZestParams`.
+      encoding: `model.Encoding`.
+      inputs: `model.Inputs`.
+      prediction: `Prediction` at t.
+      config: `presets.Config`.
+      chain: also t +- 2, by the flow found at t +- 1.
+
+    Returns:
+      `Warped`. A neighbour that does not exist is not valid and counts in nothing.
+
+    Source: ZeST-NeRF eq. 11 to eq. 13.
+    """
+    marched, here = prediction.marched, prediction.dynamic
+    world = functools.partial(world_from_frustum, encoding.frustum, spacing=config.spacing)
+    directions = encoded_directions(marched, config)
+    shape = marched.depths.shape
+    colours, certain, valid, there, back = [], [], [], [], []
+    for sign in DIRECTIONS:
+        coords, sample, exists, confidence = marched.coords, here, 1.0, 1.0
+        for step in range(1, 2 + chain):
+            flow = sample.flow_forward if sign > 0 else sample.flow_backward
+            confidence = confidence * (sample.confidence_forward if sign > 0 else sample.confidence_backward)
+            moved = coords + flow
+            time = inputs.time + sign * step
+            after = query_dynamic(
+                params, encoding, moved.reshape(-1, 3), directions, time, inputs.duration, config=config
+            )
+            after = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), after)
+            exists = exists * slot_valid(encoding_slots(inputs), sign * step)
+            weights = weights_from_density(after.density, marched.lengths)
+            colours.append(composite(weights, after.colour).values)
+            certain.append(confidence_map(weights, confidence))
+            valid.append(exists)
+            if step == 1:
+                reverse = after.flow_backward if sign > 0 else after.flow_forward
+                there.append(world_flow(world, coords, flow))
+                back.append(world_flow(world, moved, reverse))
+            coords, sample = moved, after
+    return Warped(*(jnp.stack(x) for x in (colours, certain, valid, there, back)))
+
+
+def encoding_slots(inputs):
+    """The slots of `Inputs` with times relative to the target's."""
+    return inputs.slots._replace(times=inputs.slots.times - inputs.time)
+
+
+def make_measures(params, encoding, inputs, *, config, chain=False):
+    """`Terms` of `measure(prediction, truth) -> ()` for one block of rays.
+
+    Args:
+      params: `model.ZestParams`; gradients reach the warped renders through it.
+      encoding: `model.Encoding`.
+      inputs: `model.Inputs`.
+      config: `presets.Config`.
+      chain: see `warped`.
+
+    Returns:
+      `Terms` of callables.
+
+    Source: ZeST-NeRF section 3.5.
+    """
+    memo = {}
+
+    def followed(prediction):
+        if "warped" not in memo:
+            memo["warped"] = warped(params, encoding, inputs, prediction, config=config, chain=chain)
+        return memo["warped"]
+
+    world = functools.partial(world_from_frustum, encoding.frustum, spacing=config.spacing)
+    slots = encoding_slots(inputs)
+    exists = jnp.stack([slot_valid(slots, sign) for sign in DIRECTIONS])
+
+    def flows(prediction):
+        """(2, R, S, 3) world units."""
+        coords, dynamic = prediction.marched.coords, prediction.dynamic
+        return jnp.stack([world_flow(world, coords, f) for f in (dynamic.flow_forward, dynamic.flow_backward)])
+
+    def confidences(prediction):
+        return jnp.stack([prediction.dynamic.confidence_forward, prediction.dynamic.confidence_backward])
+
+    def pho(prediction, truth):
+        found = followed(prediction)
+        return photometric_loss(found.colour, truth.colour, found.confidence, valid=found.valid)
+
+    def cyc(prediction, truth):
+        found = followed(prediction)
+        return cycle_loss(found.there, found.back, confidences(prediction), valid=exists)
+
+    def temp(prediction, truth):
+        forward, backward = flows(prediction)
+        both = jnp.broadcast_to(exists[0] * exists[1], forward.shape[:1])
+        return temporal_loss(forward, backward, valid=both)
+
+    def flow3d(prediction, truth):
+        marched = prediction.marched
+        weight = jnp.exp(-jnp.square((marched.depths / truth.depth[:, None] - 1) / NEAR_SURFACE))
+        weight = jax.lax.stop_gradient(weight) * truth.flow_valid[:, None]
+        error = (
+            jnp.abs(flows(prediction) - jnp.moveaxis(truth.flow, 1, 0)[:, :, None]) / truth.depth[None, :, None, None]
+        )
+        each = [mean_over_valid("flow3d", jnp.minimum(e, 1.0), valid=weight) for e in error]
+        return 5 * (each[0] + each[1])
+
+    def geo(prediction, truth):
+        return _geometric(prediction, truth, inputs, slots, flows(prediction))
+
+    return Terms(
+        rec=lambda p, t: reconstruction_loss(p.colour, t.colour),
+        static_rec=lambda p, t: reconstruction_loss(p.static_colour, t.static, valid=t.static_valid),
+        mask=lambda p, t: motion_mask_loss(p.dynamicness, t.moving),
+        b=lambda p, t: blend_entropy_loss(p.blend),
+        w=lambda p, t: disocclusion_loss(confidences(p), valid=exists),
+        min=lambda p, t: minimum_flow_loss(flows(p), valid=exists),
+        sp=lambda p, t: spatial_smoothness_loss(
+            flows(p), jnp.broadcast_to(p.marched.points, (2, *p.marched.points.shape)), valid=exists
+        ),
+        depth=lambda p, t: depth_loss(-1 / p.depth_of_dynamic, -1 / t.depth, valid=t.known),
+        pho=pho, cyc=cyc, temp=temp, flow3d=flow3d, geo=geo,
+    )  # fmt: skip
+
+
+def _geometric(prediction, truth, inputs, slots, flows):
+    """Where the neighbours' cameras see each ray's expected point, against where the optical flow prior does."""
+    point = unproject(inputs.camera, truth.pixels, truth.depth)
+    total = jnp.zeros(())
+    for flow, sign, known in zip(flows, DIRECTIONS, jnp.moveaxis(truth.flow, 1, 0), strict=True):
+        index = jnp.argmax((slots.times == sign).astype(jnp.int32))
+        camera = jax.tree.map(lambda x, index=index: x[index], slots.cameras)
+        seen = optical_flow(prediction.dynamic_alone, prediction.marched.points, flow, camera, truth.pixels)
+        prior = project(camera, point + known)
+        valid = (seen.visible & prior.in_front).astype(flow.dtype) * truth.known * slot_valid(slots, sign)
+        total = total + geometric_loss(seen.pixels, prior.pixels, valid=valid) / 2
+    return total

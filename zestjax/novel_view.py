@@ -1,0 +1,138 @@
+"""Novel views of a posed video: prepare a scene once, then render any camera at any of its times.
+
+N        frames of the video
+H W      rows and columns of a view, those of the video's images
+exclude  frames that must serve nothing, because they are what is to be predicted
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zestjax.analysis import FrameMaps, frame_maps
+from zestjax.assembly import dequantised, halved, target_inputs, video_evidence
+from zestjax.cameras import Camera, project
+from zestjax.frustum import world_from_frustum
+from zestjax.model import encode
+from zestjax.prediction import render_rays
+from zestjax.rays import pixel_grid
+from zestjax.video import Video
+
+BLOCK_ROWS = 8  # rows rendered together: memory does not grow with the image
+
+
+class Prepared(NamedTuple):
+    """A scene's cache. video: `Video` on the host. half: (N, 2h, 2w, 3) half-resolution images, or None.
+    maps: `FrameMaps` of every frame, or None with an encoder that has none."""
+
+    video: Video
+    half: jax.Array | None
+    maps: FrameMaps | None
+
+
+class View(NamedTuple):
+    """A rendered view. colour, static: (H, W, 3) in [0, 1]; static is the scene without what moves. dynamic: (H, W, 3)
+    the dynamic field alone, or None. depth: (H, W) world units. opacity, dynamicness: (H, W) in [0, 1].
+    flow: (H, W, 2) pixels to the next time in the same camera, or None."""
+
+    colour: jax.Array
+    static: jax.Array
+    dynamic: jax.Array | None
+    depth: jax.Array
+    opacity: jax.Array
+    dynamicness: jax.Array
+    flow: jax.Array | None
+
+
+@jax.jit
+def _maps(params, evidence):
+    return frame_maps(params, dequantised(evidence))
+
+
+def _frame_maps(params, half, video, config, *, frames=None, exclude=()):
+    evidence = video_evidence(
+        half, video.cameras, video.near, video.far, planes=config.evidence_planes, frames=frames, exclude=exclude
+    )
+    return _maps(params.analysis, evidence)
+
+
+def prepare(params, video, *, config):
+    """What a scene is asked for every view: each frame's own depth and moving pixels.
+
+    Args:
+      params: `model.ZestParams`.
+      video: `Video`.
+      config: `presets.Config`.
+
+    Returns:
+      `Prepared`.
+    """
+    video = Video(np.asarray(video.images), Camera(*map(np.asarray, video.cameras)), video.near, video.far)
+    if params.analysis is None:
+        return Prepared(video, None, None)
+    half = halved(jnp.asarray(video.images))
+    return Prepared(video, half, _frame_maps(params, half, video, config))
+
+
+def render_view(params, prepared, camera, time, *, config, exclude=()):
+    """A view from a camera at a time of the video.
+
+    Args:
+      params: `model.ZestParams`.
+      prepared: `Prepared` of the video.
+      camera: `Camera` for an image of the video's size.
+      time: int frame time.
+      config: `presets.Config`.
+      exclude: see the header; their traces in the other frames' maps are removed too.
+
+    Returns:
+      `View`.
+    """
+    video = prepared.video
+    inputs, frames = target_inputs(
+        video.images, video.cameras, video.near, video.far, camera, int(time), config=config, exclude=exclude
+    )
+    maps = prepared.maps
+    if maps is not None and len(exclude):
+        used, place = np.unique(frames, return_inverse=True)
+        used = np.resize(used, len(frames))  # one length for every target: one program
+        maps = _frame_maps(params, prepared.half, video, config, frames=[int(f) for f in used], exclude=exclude)
+        frames = place
+    if maps is not None:
+        maps = jax.tree.map(lambda x: x[frames], maps)
+    return render_inputs(params, inputs, maps, config=config)
+
+
+@functools.partial(jax.jit, static_argnames=("config",))
+def render_inputs(params, inputs, maps, *, config):
+    """`View` of `model.Inputs` and the frames' maps; a pure function, compiled once for a size and a configuration."""
+    encoding = encode(params, inputs, maps, config=config)
+    height, width = inputs.key.images.shape[1:3]
+    rows = -(-height // BLOCK_ROWS)
+    pixels = pixel_grid(rows * BLOCK_ROWS, width).reshape(rows, -1, 2)
+    block = lambda p: _view_block(render_rays(params, encoding, inputs, p, config=config), encoding, inputs, p, config)
+    blocks = jax.lax.map(block, pixels)
+    image = lambda x: x.reshape(rows * BLOCK_ROWS, width, *x.shape[2:])[:height]
+    view = jax.tree.map(image, blocks)
+    shown = lambda x: None if x is None else jnp.clip(x, 0, 1)
+    return view._replace(colour=shown(view.colour), static=shown(view.static), dynamic=shown(view.dynamic))
+
+
+def _view_block(prediction, encoding, inputs, pixels, config):
+    p = prediction
+    flow = None if p.dynamic is None else _optical_flow(p, encoding.frustum, inputs.camera, pixels, config)
+    return View(p.colour, p.static_colour, p.dynamic_colour, p.depth, p.opacity, p.dynamicness, flow)
+
+
+def _optical_flow(prediction, frustum, camera, pixels, config):
+    """(R, 2) pixels by which the rays' expected points move until the next time; what is static stays."""
+    marched = prediction.marched
+    moved = world_from_frustum(frustum, marched.coords + prediction.dynamic.flow_forward, spacing=config.spacing)
+    flow = jnp.sum(prediction.dynamic_weights[..., None] * (moved - marched.points), axis=1)
+    total = jnp.maximum(jnp.sum(prediction.weights, axis=1, keepdims=True), 1e-6)
+    point = jnp.sum(prediction.weights[..., None] * marched.points, axis=1) / total
+    before, after = project(camera, point), project(camera, point + flow / total)
+    return jnp.where((before.in_front & after.in_front)[:, None], after.pixels - before.pixels, 0)
