@@ -4,7 +4,9 @@ Frame i of the input video is from camera i mod 12; the other cameras at each ti
 Photographs are disjoint from the ones models are trained on (`textures.PHOTOGRAPHS`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +26,7 @@ class _Recipe:
     """fill: adds the things of a scene to (layout, chance, view). seed: of the looks. effects: of `Effects`. The rest
     sets the view, the rig and the light."""
 
-    fill: object
+    fill: Callable
     seed: int
     effects: dict = field(default_factory=lambda: SHADOWS)
     degrees: float = 55.0
@@ -62,7 +64,7 @@ def bench_scene(name, *, height=144, width=256):
     room = {"half_width": 0.9 * view.across * view.reach + 0.8, "ceiling": 1.6, "behind": 4.0}
     props.add_room(layout, chance, view, **(room | recipe.room))
     recipe.fill(layout, chance, view)
-    gain = {"exposure": np.full((FRAMES, 3), recipe.gain, np.float32)}
+    gain: dict[str, Any] = {"exposure": np.full((FRAMES, 3), recipe.gain, np.float32)}
     scene = layout.scene(
         atlas=random_atlas(chance, "bench"), light=recipe.light, ambient=recipe.ambient,
         effects=Effects(**(gain | recipe.effects)), mid_time=MIDDLE,

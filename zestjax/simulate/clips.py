@@ -36,8 +36,8 @@ class Clip(NamedTuple):
     moving: np.ndarray
     intrinsics: np.ndarray
     camera_from_world: np.ndarray
-    near: np.ndarray
-    far: np.ndarray
+    near: np.floating
+    far: np.floating
     target_images: np.ndarray
     target_depth: np.ndarray
     target_moving: np.ndarray

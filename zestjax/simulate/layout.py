@@ -5,7 +5,7 @@ scene's units. A `Layout` collects bodies and pads them to fixed counts, so that
 size runs in one compiled program.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,12 +101,15 @@ class Layout:
             if count > most:
                 raise ValueError(f"Layout.scene: {count} {kind}, expected at most {most}.")
         index = lambda handle: -1 if handle is None else handle[1] + (boxes if handle[0] == "ball" else 0)
-        parts = [
+        tables: list[Any] = [
             _table(bodies, count, index, mid_time, unit)
             for bodies, count in ((self._boxes, boxes), (self._balls, balls))
         ]
-        light = np.asarray(light, np.float32) * np.float32(unit)
-        return Scene(*parts, np.asarray(atlas), light, np.float32(ambient), effects)
+        lamp: dict[str, Any] = {
+            "light": np.asarray(light, np.float32) * np.float32(unit),
+            "ambient": np.float32(ambient),
+        }
+        return Scene(boxes=tables[0], balls=tables[1], atlas=atlas, effects=effects, **lamp)
 
 
 def _scaled(matrix, unit, *, offset_only=False):
@@ -115,46 +118,34 @@ def _scaled(matrix, unit, *, offset_only=False):
     return matrix
 
 
-def _rows(body, index, mid_time, unit):
-    """The arrays of one body; see `Layout.scene`."""
+def _row(body, index, mid_time, unit):
+    """One body's fields of `Bodies`, less its motion, and of `Motion`."""
     extent = np.linalg.norm(np.asarray(body.shape)[:3, :3], axis=0)
     position = np.asarray(body.position) - mid_time * turned(body.turn) @ np.asarray(body.velocity)
-    motion = Motion(
-        joint=_scaled(affine(turned(body.turn), position), unit, offset_only=True),
-        parent=np.int32(index(body.parent)),
-        velocity=np.asarray(body.velocity) * unit,
-        sway=np.asarray(body.sway) * unit,
-        spin=np.asarray(body.spin),
-        swing=np.asarray(body.swing),
-        strain=np.asarray(body.strain),
-        rate=body.rate,
-        phase=body.phase,
-    )
-    textures = body.textures if len(body.textures) == 3 else body.textures * 3
-    return Bodies(
-        shape=_scaled(body.shape, unit),
-        present=True,
-        hollow=body.hollow,
-        texture=np.asarray(textures, np.int32),
-        tiling=extent / body.tile,
-        offset=np.asarray(body.offset),
-        tint=np.asarray(body.tint),
-        gloss=body.gloss,
-        motion=motion,
-    )
+    motion = {
+        "joint": _scaled(affine(turned(body.turn), position), unit, offset_only=True),
+        "parent": np.int32(index(body.parent)),
+        "velocity": np.asarray(body.velocity) * unit,
+        "sway": np.asarray(body.sway) * unit,
+    } | {name: getattr(body, name) for name in ("spin", "swing", "strain", "rate", "phase")}
+    look = {
+        "shape": _scaled(body.shape, unit),
+        "present": True,
+        "texture": np.asarray(body.textures if len(body.textures) == 3 else body.textures * 3, np.int32),
+        "tiling": extent / body.tile,
+    } | {name: getattr(body, name) for name in ("hollow", "offset", "tint", "gloss")}
+    return look, motion
 
 
 def _table(bodies, count, index, mid_time, unit):
     """`Bodies` of `count` rows, the ones not in use absent."""
-    absent = Body(sized((1, 1, 1)), (0,))
-    rows = [_rows(body, index, mid_time, unit) for body in bodies]
-    rows += [_rows(absent, index, mid_time, unit)._replace(present=False)] * (count - len(bodies))
-    flat = [_flat(row) for row in rows]
-    columns = [np.stack([np.asarray(row[i]) for row in flat]) for i in range(len(flat[0]))]
-    columns = [c.astype(np.float32) if c.dtype == np.float64 else c for c in columns]
-    motion = Motion(*columns[len(Bodies._fields) - 1 :])
-    return Bodies(*columns[: len(Bodies._fields) - 1], motion)
+    absent, still = _row(Body(sized((1, 1, 1)), (0,)), index, mid_time, unit)
+    rows = [_row(body, index, mid_time, unit) for body in bodies]
+    looks, motions = zip(*rows, *[(absent | {"present": False}, still)] * (count - len(bodies)), strict=True)
+    return Bodies(**_stacked(looks), motion=Motion(**_stacked(motions)))
 
 
-def _flat(row):
-    return (*row[:-1], *row.motion)
+def _stacked(rows) -> dict[str, Any]:
+    """Columns of rows of one set of names; floats as float32."""
+    columns = {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
+    return {name: c.astype(np.float32) if c.dtype == np.float64 else c for name, c in columns.items()}

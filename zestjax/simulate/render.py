@@ -35,13 +35,14 @@ def _pixel_grid(height, width, dtype):
 
 
 def seen_surface(scene, camera, time, *, height, width):
-    """depth (H, W), body (H, W) int32 and point (H, W, 3) at the pixels' centres: a `Frame` without its image."""
+    """What a camera sees at the pixels' centres: a `Frame` whose image is black."""
     bodies = all_bodies(scene)
     u, v = _pixel_grid(height, width, camera.intrinsics.dtype)
     origin, direction = camera_rays(camera, u, v)
     hit = nearest_hit(placed_bodies(bodies, time), origin, direction, boxes=scene.boxes.present.shape[0])
     point = along(origin, jnp.where(hit.body < 0, 1, hit.distance), direction)
-    return Frame(None, hit.distance, hit.body, jnp.stack(point, axis=-1))
+    point = jnp.stack(point, axis=-1)
+    return Frame(jnp.zeros_like(point), hit.distance, hit.body, point)
 
 
 def render(scene, camera, time, *, height, width, samples=2):

@@ -4,6 +4,8 @@ N        cameras or frames
 width    of the view at a distance: 2 * tan(half the horizontal field of view) * distance
 """
 
+from typing import Any
+
 import numpy as np
 
 from zestjax.cameras import Camera
@@ -40,7 +42,8 @@ def cameras_at(positions, angles, intrinsics, *, unit=1.0):
     poses = np.tile(np.eye(4), (len(yaw), 1, 1))
     poses[:, :3, :3] = rotation
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", rotation, np.asarray(positions, np.float64) * unit)
-    return Camera(np.tile(np.asarray(intrinsics, np.float32), (len(yaw), 1, 1)), poses.astype(np.float32))
+    leaves: tuple[Any, Any] = (np.tile(np.asarray(intrinsics, np.float32), (len(yaw), 1, 1)), poses.astype(np.float32))
+    return Camera(*leaves)
 
 
 def angles_towards(positions, target):
