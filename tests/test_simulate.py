@@ -50,7 +50,9 @@ def toy_scene(effects=None, *, ambient=1.0):
         velocity=(0.05, 0, 0.01),
         spin=(0, 0.08, 0),
     )
-    layout.ball(shape=sized((0.2, 0.2, 0.2), (0, -0.6, 0)), parent=block, textures=(1,), swing=(0, 0, 0.2), rate=0.7)
+    layout.ball(
+        shape=sized((0.2, 0.2, 0.2), offset=(0, -0.6, 0)), parent=block, textures=(1,), swing=(0, 0, 0.2), rate=0.7
+    )
     strain = np.array([[0.3, 0.1, 0], [0, -0.2, 0], [0, 0, 0.1]])
     layout.ball(shape=sized((0.5, 0.4, 0.3)), position=(0.9, 0, 3.2), textures=(2,), strain=strain, rate=0.5)
     layout.ball(shape=sized((0.3, 0.3, 0.3)), position=(0.3, 0.5, 3.9), textures=(0,), gloss=0.5)
@@ -85,7 +87,9 @@ def crossing_by_loops(matrix, box, origin, direction):
 def test_the_nearest_hit_and_the_shadow_equal_loops_over_faces_and_roots():
     chance = np.random.default_rng(0)
     linear = chance.normal(size=(5, 3, 3)) * 0.5 + np.eye(3)
-    matrices = np.stack([affine(m, offset) for m, offset in zip(linear, chance.normal(size=(5, 3)), strict=True)])
+    matrices = np.stack(
+        [affine(linear=m, offset=offset) for m, offset in zip(linear, chance.normal(size=(5, 3)), strict=True)]
+    )
     present, hollow = np.array([True, True, False, True, True]), np.array([False, True, False, False, False])
     origins, directions = chance.normal(size=(2, 3, 200))
     placed = Placed(jnp.asarray(matrices), jnp.asarray(present), jnp.asarray(hollow))
@@ -202,7 +206,7 @@ def test_an_effect_that_is_not_named_is_not_in_the_program():
     bare = size(Effects())
     for name in Effects._fields:
         assert size(Effects()._replace(**{name: getattr(ALL, name)})) > bare, name
-    compiled = lambda effects: jax.jit(noisy).lower(toy_scene(effects)).compile().as_text().count(" = ")
+    compiled = lambda effects: str(jax.jit(noisy).lower(toy_scene(effects)).compile().as_text()).count(" = ")
     assert compiled(ALL) > 1.2 * compiled(Effects())
 
 

@@ -25,7 +25,7 @@ def clips():
     made, programs = [], []
     for seed in (0, 1, 0):
         made.append(training_clip(jax.random.key(seed), frames=4, targets=3, **SIZE))
-        programs.append(shot._cache_size())
+        programs.append(shot._cache_size())  # pyright: ignore[reportAttributeAccessIssue]
     return made, programs
 
 

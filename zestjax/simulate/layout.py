@@ -36,7 +36,7 @@ class Body(NamedTuple):
     phase: float = 0.0
 
 
-def affine(linear=None, offset=(0, 0, 0)):
+def affine(*, linear=None, offset=(0, 0, 0)):
     """(4, 4) float32 matrix."""
     matrix = np.eye(4, dtype=np.float32)
     matrix[:3, :3] = np.eye(3) if linear is None else linear
@@ -50,9 +50,9 @@ def turned(angle):
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]], np.float32)
 
 
-def sized(half, offset=(0, 0, 0)):
+def sized(half, *, offset=(0, 0, 0)):
     """Shape of a body of half-lengths `half` whose middle is at `offset` in its joint."""
-    return affine(np.diag(np.asarray(half, np.float32)), offset)
+    return affine(linear=np.diag(np.asarray(half, np.float32)), offset=offset)
 
 
 class Layout:
@@ -123,7 +123,7 @@ def _row(body, index, mid_time, unit):
     extent = np.linalg.norm(np.asarray(body.shape)[:3, :3], axis=0)
     position = np.asarray(body.position) - mid_time * turned(body.turn) @ np.asarray(body.velocity)
     motion = {
-        "joint": _scaled(affine(turned(body.turn), position), unit, offset_only=True),
+        "joint": _scaled(affine(linear=turned(body.turn), offset=position), unit, offset_only=True),
         "parent": np.int32(index(body.parent)),
         "velocity": np.asarray(body.velocity) * unit,
         "sway": np.asarray(body.sway) * unit,

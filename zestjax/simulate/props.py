@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zestjax.simulate.layout import affine, sized
+from zestjax.simulate.layout import sized
 from zestjax.simulate.textures import SLOTS
 
 
@@ -128,7 +128,7 @@ def add_walker(layout, chance, view, *, z, x, size, speed, heading, rate):
     gait = dict(rate=rate, phase=chance.uniform(0, 6.3))
     hips = view.floor - 0.96 * size
     trunk = layout.box(
-        shape=sized((0.22 * size, 0.32 * size, 0.14 * size), (0, -0.32 * size, 0)), turn=heading,
+        shape=sized((0.22 * size, 0.32 * size, 0.14 * size), offset=(0, -0.32 * size, 0)), turn=heading,
         position=(x * view.across * z, hips, z), velocity=(0, 0, speed), sway=(0, 0.02 * size, 0), **gait, **looks[0],
     )  # fmt: skip
     layout.ball(
@@ -137,17 +137,17 @@ def add_walker(layout, chance, view, *, z, x, size, speed, heading, rate):
     )  # fmt: skip
     stride = min(0.7, 1.2 * abs(speed) / max(size * rate, 1e-6)) + 0.12
     for side in (-1, 1):
-        arm = sized((0.07 * size, 0.3 * size, 0.07 * size), (0, 0.27 * size, 0))
+        arm = sized((0.07 * size, 0.3 * size, 0.07 * size), offset=(0, 0.27 * size, 0))
         layout.box(
             shape=arm, position=(side * 0.3 * size, -0.6 * size, 0), parent=trunk, swing=(-side * 0.8 * stride, 0, 0),
             **gait, **looks[1],
         )  # fmt: skip
         thigh = layout.box(
-            shape=sized((0.09 * size, 0.25 * size, 0.1 * size), (0, 0.23 * size, 0)), parent=trunk,
+            shape=sized((0.09 * size, 0.25 * size, 0.1 * size), offset=(0, 0.23 * size, 0)), parent=trunk,
             position=(side * 0.12 * size, 0, 0), swing=(side * stride, 0, 0), **gait, **looks[2],
         )  # fmt: skip
         layout.box(
-            shape=sized((0.08 * size, 0.25 * size, 0.09 * size), (0, 0.23 * size, 0)), parent=thigh,
+            shape=sized((0.08 * size, 0.25 * size, 0.09 * size), offset=(0, 0.23 * size, 0)), parent=thigh,
             position=(0, 0.47 * size, 0), swing=(0.5 * stride, 0, 0), **gait, **looks[2],
         )  # fmt: skip
 
@@ -158,8 +158,8 @@ def add_pendulum(layout, chance, view, *, z, x, size, swing, rate):
     gait = dict(rate=rate, phase=chance.uniform(0, 6.3))
     thin = 0.006 * view.width(z)
     rod = layout.box(
-        shape=affine(np.diag([thin, length / 2, thin]), (0, length / 2, 0)), position=(x * view.across * z, top, z),
+        shape=sized((thin, length / 2, thin), offset=(0, length / 2, 0)), position=(x * view.across * z, top, z),
         turn=chance.uniform(-0.5, 0.5), swing=(0.2 * swing, 0, swing), **gait, **finish(chance, view, z, length),
     )  # fmt: skip
     add = layout.box if chance.random() < 0.4 else layout.ball
-    add(shape=sized((size,) * 3, (0, length, 0)), parent=rod, **finish(chance, view, z, size))
+    add(shape=sized((size,) * 3, offset=(0, length, 0)), parent=rod, **finish(chance, view, z, size))
