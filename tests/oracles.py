@@ -57,14 +57,14 @@ def assert_grads_match(fn, *args, step=1e-6):
         weigh = lambda t: sum(jax.tree.leaves(jax.tree.map(lambda w, x: jnp.sum(w * x), mix, fn(*moved(t)))))
         return jax.value_and_grad(weigh)(t)
 
-    numeric = (both(jnp.float64(step))[0] - both(jnp.float64(-step))[0]) / (2 * step)
-    np.testing.assert_allclose(both(jnp.float64(0))[1], numeric, rtol=1e-5, atol=1e-7)
+    numeric = (both(jnp.asarray(step, np.float64))[0] - both(jnp.float64(-step))[0]) / (2 * step)
+    np.testing.assert_allclose(both(jnp.asarray(0, np.float64))[1], numeric, rtol=1e-5, atol=1e-7)
 
 
 def weights_by_loop(density, lengths):
     """NeRF eq. 3, one sample at a time."""
     reaching, weights = 1.0, []
-    for sigma, delta in zip(np.float64(density), np.float64(lengths), strict=True):
+    for sigma, delta in zip(np.asarray(density, np.float64), np.asarray(lengths, np.float64), strict=True):
         alpha = 1.0 - np.exp(-sigma * delta)
         weights.append(reaching * alpha)
         reaching *= 1.0 - alpha
@@ -74,7 +74,7 @@ def weights_by_loop(density, lengths):
 def blend_by_loop(static_alpha, dynamic_alpha, blend):
     """NSFF section 3.3: a sample's opacity is shared between the fields by its blend."""
     reaching, static, dynamic = 1.0, [], []
-    for a, d, b in zip(*(np.float64(x) for x in (static_alpha, dynamic_alpha, blend)), strict=True):
+    for a, d, b in zip(*(np.asarray(x, np.float64) for x in (static_alpha, dynamic_alpha, blend)), strict=True):
         static.append(reaching * a * (1 - b))
         dynamic.append(reaching * d * b)
         reaching *= (1 - a * (1 - b)) * (1 - d * b)
@@ -84,7 +84,7 @@ def blend_by_loop(static_alpha, dynamic_alpha, blend):
 def density_blend_by_loop(static_density, dynamic_density, blend, lengths):
     """ZeST-NeRF eq. 7-9, with b inside the sum."""
     thickness, static, dynamic = 0.0, [], []
-    columns = (np.float64(x) for x in (static_density, dynamic_density, blend, lengths))
+    columns = (np.asarray(x, np.float64) for x in (static_density, dynamic_density, blend, lengths))
     for s, d, b, length in zip(*columns, strict=True):
         reaching = np.exp(-thickness)
         static.append(reaching * (1 - b) * (1 - np.exp(-s * length)))
@@ -95,7 +95,7 @@ def density_blend_by_loop(static_density, dynamic_density, blend, lengths):
 
 def distortion_by_loop(weights, edges):
     """mip-NeRF 360 eq. 15, over all pairs of one ray."""
-    weights, edges = np.float64(weights), np.float64(edges)
+    weights, edges = np.asarray(weights, np.float64), np.asarray(edges, np.float64)
     middles = (edges[1:] + edges[:-1]) / 2
     total = 0.0
     for i, wi in enumerate(weights):

@@ -63,9 +63,9 @@ def test_alignment_recovers_a_scale_and_shift():
 
 def test_least_squares_alignment_equals_lstsq():
     values, target, weight = uniform(2, 3, 30)
-    root = np.sqrt(np.float64(weight))
-    columns = np.stack([np.float64(values), np.ones(30)], -1) * root[:, None]
-    expected = np.linalg.lstsq(columns, np.float64(target) * root, rcond=None)[0]
+    root = np.sqrt(np.asarray(weight, np.float64))
+    columns = np.stack([np.asarray(values, np.float64), np.ones(30)], -1) * root[:, None]
+    expected = np.linalg.lstsq(columns, np.asarray(target, np.float64) * root, rcond=None)[0]
     np.testing.assert_allclose(
         jax.jit(depth.align_least_squares)(values, target, weight), expected, rtol=1e-4, atol=1e-5
     )

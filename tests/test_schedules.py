@@ -38,9 +38,9 @@ def test_a_prior_past_its_end_is_absent():
 
 @pytest.mark.parametrize("shape", ["staircase", "smooth"])
 def test_a_traced_step_gives_the_same_weights(shape):
-    options = dict(decay=7, shape=shape, end=40)
-    traced = jax.jit(jax.vmap(lambda step: schedules.decayed_priors(PAPER_WEIGHTS, step, **options).geo))
-    known = [schedules.decayed_priors(PAPER_WEIGHTS, step, **options).geo for step in range(50)]
+    weight = lambda step: schedules.decayed_priors(PAPER_WEIGHTS, step, decay=7, shape=shape, end=40).geo
+    traced = jax.jit(jax.vmap(weight))
+    known = [weight(step) for step in range(50)]
     np.testing.assert_allclose(traced(jnp.arange(50)), known, rtol=1e-4, atol=1e-12)
 
 

@@ -13,7 +13,7 @@ Names and axes, the same in every function of this file:
 Leading axes `...` are free. `lengths` and `depths` may lack them, (S,), when every ray is sampled alike.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ class Rendered(NamedTuple):
     weights: (..., S).
     """
 
-    values: object
+    values: Any
     opacity: jax.Array
     weights: jax.Array
 

@@ -66,7 +66,7 @@ def discriminator(params, patches, *, spectral=True):
     x = jax.nn.leaky_relu(conv2d(bounded(first), 2 * patches - 1, stride=2), SLOPE)
     for conv, norm in zip(middle, params.norms, strict=True):
         x = norm_act(norm, conv2d(bounded(conv), x, stride=2), slope=SLOPE, instance=True)
-    return conv2d(bounded(last), x)[..., 0]
+    return jnp.squeeze(conv2d(bounded(last), x), axis=-1)
 
 
 def spectral_norm(kernel, *, iterations=8):

@@ -54,5 +54,6 @@ def photometric_loss(warped, target, confidence, *, valid=None, normalise="count
     """
     check_shapes("photometric_loss", warped=(warped, "... 3"), target=(target, "... 3"))
     residual = warped - jnp.broadcast_to(target, warped.shape)
-    options = dict(norm="squared", valid=valid, confidence=confidence, normalise=normalise)
-    return mean_over_valid("photometric_loss", residual, **options)
+    return mean_over_valid(
+        "photometric_loss", residual, norm="squared", valid=valid, confidence=confidence, normalise=normalise
+    )

@@ -36,8 +36,8 @@ def cycle_loss(flow_there, flow_back, confidence, *, valid=None, norm="absolute"
       ValueError: if the shapes do not fit.
     """
     check_shapes("cycle_loss", flow_there=(flow_there, "... S 3"), flow_back=(flow_back, "... S 3"))
-    options = dict(norm=norm, valid=valid, confidence=confidence, normalise=normalise)
-    return mean_over_valid("cycle_loss", flow_there + flow_back, **options)
+    residual = flow_there + flow_back
+    return mean_over_valid("cycle_loss", residual, norm=norm, valid=valid, confidence=confidence, normalise=normalise)
 
 
 def minimum_flow_loss(flow, *, valid=None, sum_components=False):

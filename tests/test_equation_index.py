@@ -1,0 +1,47 @@
+"""zestjax/EQUATIONS.md and the docstrings' `Source:` lines say the same thing."""
+
+import importlib
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+import zestjax
+
+INDEX = Path(zestjax.__file__).parent / "EQUATIONS.md"
+ROWS = [
+    tuple(cell.strip() for cell in line.strip("|\n ").split("|"))[:3] for line in INDEX.read_text().splitlines()[2:]
+]
+LISTED = sorted({function.rsplit(".", 1)[0] for _, _, function in ROWS})
+
+
+def source(function):
+    """The docstring's `Source:` paragraph up to the next heading, on one line; empty if it has none."""
+    _, found, rest = (inspect.getdoc(function) or "").partition("Source:")
+    return " ".join(re.split(r"\n\s*\n|\n(?:Reference|Differs|Args|Returns)", rest)[0].split()) if found else ""
+
+
+def cites(text, label):
+    return re.search(re.escape(label) + r"(?!\d)", text) is not None
+
+
+@pytest.mark.parametrize("paper, label, function", ROWS, ids=[f"{row[2]}-{row[1]}" for row in ROWS])
+def test_a_row_names_a_function_that_cites_it(paper, label, function):
+    module, name = function.rsplit(".", 1)
+    text = source(getattr(importlib.import_module(module), name))
+    assert paper.split()[0] in text and cites(text, label), f"{function} cites: {text!r}"
+
+
+@pytest.mark.parametrize("module", LISTED)
+def test_a_listed_module_has_a_row_for_every_equation_of_the_paper_it_cites(module):
+    members = vars(importlib.import_module(module)).items()
+    for name, function in members:
+        if inspect.isfunction(function) and function.__module__ == module and "ZeST-NeRF eq." in source(function):
+            ours = source(function).split(";")[0] if "NeRF (Mildenhall" in source(function) else source(function)
+            for label in re.findall(r"eq\. \d+", ours):
+                assert ("ZeST-NeRF", label, f"{module}.{name}") in ROWS, f"{module}.{name} cites {label}"
+
+
+def test_rows_are_not_repeated():
+    assert len(set(ROWS)) == len(ROWS)
