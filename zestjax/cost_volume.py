@@ -102,7 +102,7 @@ def sweep_colours(images, homographies, grid):
 
     @jax.checkpoint
     def plane(homographies):
-        values = lax.map(lambda view: warp(*view, grid).values, (images, homographies))
+        values = lax.map(lambda view: warp(view[0], view[1], grid).values, (images, homographies))
         return jnp.moveaxis(values, 0, -2).reshape(*grid.shape[:2], -1)
 
     return lax.map(plane, homographies).reshape(sizes["D"], sizes["h"], sizes["w"], -1)

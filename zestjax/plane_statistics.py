@@ -41,6 +41,14 @@ class CostVolume(NamedTuple):
     samples: jax.Array
 
 
+class _Given(NamedTuple):
+    """Gradients towards the statistics of a `CostVolume`; None where a caller did not use one, which costs nothing."""
+
+    mean: jax.Array | None
+    variance: jax.Array | None
+    count: jax.Array | None
+
+
 class Sweep(NamedTuple):
     """What is fixed while tracing: source height and width, C, channels kept per view, the trust floor or None."""
 
@@ -101,22 +109,22 @@ def _block(sweep, flat, homographies, depth, grid):
 
 def _stream(sweep, flat, homographies, depths, grid):
     """`plane_statistics` as JAX would differentiate it."""
-    return lax.map(lambda block: _block(sweep, flat, *block, grid), (homographies, depths))
+    return lax.map(lambda block: _block(sweep, flat, block[0], block[1], grid), (homographies, depths))
 
 
 def _stream_forward(sweep, flat, homographies, depths, grid):
     turned = jnp.zeros(0) if homographies.perturbed else None  # are the cameras being fitted?
     inputs = (flat.value, homographies.value, depths.value, grid.value)
     volume = _stream(sweep, *inputs)
-    return volume, (inputs, volume._replace(samples=None), turned)
+    return volume, (inputs, volume[:3], turned)
 
 
 def _stream_backward(sweep, saved, cotangent):
     """One view at a time, and for it one block of planes at a time: gather again, add to the view's table gradient."""
     (flat, homographies, depths, grid), volume, turned = saved
-    given = CostVolume(*(None if isinstance(c, SymbolicZero) else c for c in cotangent))
-    per_view = None if given.samples is None else jnp.moveaxis(given.samples, -2, 0)
-    given = given._replace(samples=None)
+    *given, per_view = (None if isinstance(c, SymbolicZero) else c for c in cotangent)
+    given = _Given(*given)
+    per_view = None if per_view is None else jnp.moveaxis(per_view, -2, 0)
 
     def view(_, inputs):
         table, homographies, sample_gradients = inputs
@@ -146,15 +154,16 @@ def _stream_backward(sweep, saved, cotangent):
 
 def _view_gradient(value, weight, volume, given):
     """Gradients towards one view's value (b, h, w, C) and weight (b, h, w), from those towards the statistics."""
-    share = 1 / jnp.where(volume.count > 0, volume.count, 1)
-    delta = value - volume.mean
+    mean, variance, count = volume
+    share = 1 / jnp.where(count > 0, count, 1)
+    delta = value - mean
     towards_value, towards_weight = jnp.zeros_like(value), jnp.zeros_like(weight)
     if given.mean is not None:
         towards_value += given.mean
         towards_weight += jnp.sum(given.mean * delta, axis=-1)
     if given.variance is not None:
         towards_value += 2 * given.variance * delta
-        towards_weight += jnp.sum(given.variance * (delta * delta - volume.variance), axis=-1)
+        towards_weight += jnp.sum(given.variance * (delta * delta - variance), axis=-1)
     towards_weight = towards_weight * share
     if given.count is not None:
         towards_weight += given.count

@@ -133,9 +133,8 @@ def trilinear(volume, cells, *, border="clamp"):
     sizes = check_shapes("trilinear", volume=(volume, "D H W C"), cells=(cells, "... 3"))
     check_option("trilinear", border=(border, ("clamp", "zero")))
     depth, height, width = shape = volume.shape[:3]
-    inside = True
-    for axis, size in enumerate(shape):
-        inside &= (cells[..., axis] >= -EDGE) & (cells[..., axis] <= size - 1 + EDGE)
+    within = lambda axis: (cells[..., axis] >= -EDGE) & (cells[..., axis] <= shape[axis] - 1 + EDGE)
+    inside = within(0) & within(1) & within(2)
     if border == "zero":
         cells = jnp.where(inside[..., None], cells, 0)
     plane, along = split(jnp.clip(cells[..., 0], 0, depth - 1), depth)
