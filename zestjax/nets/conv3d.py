@@ -111,20 +111,22 @@ def _reverse(kernel):
 def _gather(fine, kernel, stride):
     """Coarse volume of a fine one: one 2-D convolution, the kernel's depth among its channels in, or out if fewer."""
     n_in, n_out = kernel.shape[3:]
-    planes = (fine.shape[0] - 1) // stride * stride + 1
-    depth = lambda x, i: lax.slice_in_dim(x, i, i + planes, stride)
     convolve = lambda x, kernel: lax.conv_general_dilated(
         x, kernel, (stride, stride), [(1, 1)] * 2, dimension_numbers=IMAGES
     )
-    ends = [(1, 1), (0, 0), (0, 0), (0, 0)]
     if n_in <= n_out or stride == 2:
-        fine = jnp.pad(fine, ends)
-        taps = jnp.concatenate([depth(fine, i) for i in range(3)], axis=-1)
-        return convolve(taps, kernel.transpose(1, 2, 0, 3, 4).reshape(3, 3, 3 * n_in, n_out))
+        kernel = kernel.transpose(1, 2, 0, 3, 4).reshape(3, 3, 3 * n_in, n_out)
+        return convolve(jnp.concatenate(_depth_taps(fine, stride), axis=-1), kernel)
     shares = convolve(fine, kernel.transpose(1, 2, 3, 0, 4).reshape(3, 3, n_in, 3 * n_out))
-    shares = jnp.pad(shares, ends)
-    first, *rest = (depth(shares[..., i * n_out : (i + 1) * n_out], i) for i in range(3))
-    return sum(rest, first)
+    first, second, third = (shares[..., i * n_out : (i + 1) * n_out] for i in range(3))
+    return _depth_taps(first, 1)[0] + second + _depth_taps(third, 1)[2]
+
+
+def _depth_taps(fine, stride):
+    """What each of the kernel's planes reads of a volume: three of (ceil(D / stride), H, W, C), zero outside."""
+    planes = (fine.shape[0] - 1) // stride * stride + 1
+    fine = jnp.pad(fine, [(1, 1), (0, 0), (0, 0), (0, 0)])
+    return [lax.slice_in_dim(fine, i, i + planes, stride) for i in range(3)]
 
 
 def _spread(coarse, kernel):
@@ -145,20 +147,18 @@ def _spread(coarse, kernel):
 
 
 def _kernel_gradient(fine, coarse, stride):
-    """Columns of the fine volume, transposed, times the coarse one, plane by plane: (3, 3, 3, n_fine, n_coarse)."""
+    """The coarse volume, transposed, times columns of the fine one, plane by plane: (3, 3, 3, n_fine, n_coarse)."""
     n_fine, n_coarse = fine.shape[-1], coarse.shape[-1]
     if stride == 1 and n_coarse < n_fine:  # fewer columns
         return _reverse(_kernel_gradient(coarse, fine, 1))
     h, w = (stride * (n - 1) + 1 for n in coarse.shape[1:3])
-    fine = jnp.pad(fine, [(1, 1), (1, 1), (1, 1), (0, 0)])
+    near = jnp.pad(jnp.concatenate(_depth_taps(fine, stride), axis=-1), [(0, 0), (1, 1), (1, 1), (0, 0)])
 
     def plane(total, inputs):
-        z, coarse = inputs
-        near = lax.dynamic_slice_in_dim(fine, stride * z, 3)
-        taps = [near[i, j : j + h : stride, k : k + w : stride] for i, j, k in np.ndindex(3, 3, 3)]
+        near, coarse = inputs
+        taps = [near[j : j + h : stride, k : k + w : stride] for j in range(3) for k in range(3)]
         columns = jnp.concatenate(taps, axis=-1).reshape(-1, 27 * n_fine)
-        return total + columns.T @ coarse.reshape(-1, n_coarse), None
+        return total + coarse.reshape(-1, n_coarse).T @ columns, None
 
-    zero = jnp.zeros((27 * n_fine, n_coarse), fine.dtype)
-    total, _ = lax.scan(plane, zero, (jnp.arange(coarse.shape[0]), coarse))
-    return total.reshape(3, 3, 3, n_fine, n_coarse)
+    total, _ = lax.scan(plane, jnp.zeros((n_coarse, 27 * n_fine), fine.dtype), (near, coarse))
+    return total.reshape(n_coarse, 3, 3, 3, n_fine).transpose(3, 1, 2, 4, 0)
