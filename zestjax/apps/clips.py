@@ -112,7 +112,7 @@ def make_clip(spec, folder, index):
         from zestjax.presets import preset
 
         clip, key = clip_from_arrays(read_clip(path)), hole_key(spec.seed, index)
-        prepared = prepare_clip(key, clip, preset("small", planes=spec.planes))
+        prepared = prepare_clip(key, clip, preset("small", evidence_planes=spec.planes))
         evidence = {f"{EVIDENCE}{name}": array for name, array in prepared.evidence._asdict().items()}
         write_clip(found, evidence | {"holes": np.array(prepared.holes, int)})
 

@@ -4,9 +4,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from zestjax.cameras import Camera
+from zestjax.cameras import Camera, project, unproject
 from zestjax.checks import check_option
 from zestjax.io.scenes import PROTOCOLS, Scene, Target, load_scene
 
@@ -75,16 +76,25 @@ def held_out_camera(simulated, time):
 
 
 def target_from_answers(shown, i, camera, protocol):
-    """The i-th of `Answers` as a `Target`; its flow is towards the next input frame, NaN where that does not see it."""
-    time = int(shown.times[i])
-    known = shown.visible[i, 0]
+    """The i-th of `Answers` as a `Target`; its flow is towards the next time, as its own camera would see it."""
+    time, view = int(shown.times[i]), Camera(*(np.asarray(leaf)[i] for leaf in shown.cameras))
     return Target(
         time=time,
         camera_name="input" if protocol != "held-out" else f"cam{camera:02d}",
-        camera=Camera(*(np.asarray(leaf)[i] for leaf in shown.cameras)),
+        camera=view,
         image=shown.images[i],
         dynamic=shown.moving[i],
         exclude=(time,) if protocol == "strict" else (),
         depth=shown.depth[i],
-        flow=np.where(known[..., None], shown.flow[i, 0], np.nan),
+        flow=_flow_in_place(view, shown.depth[i], shown.scene_flow[i, 0]),
     )
+
+
+def _flow_in_place(camera, depth, displacement):
+    """(H, W, 2) pixels by which the points of a view move in a camera that stands still; NaN where they leave it."""
+    pixels = np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in depth.shape[::-1])), -1)
+    known = np.isfinite(depth)
+    points = unproject(Camera(*map(jnp.asarray, camera)), jnp.asarray(pixels), jnp.asarray(np.where(known, depth, 1)))
+    landed = project(Camera(*map(jnp.asarray, camera)), points + jnp.asarray(displacement, jnp.float32))
+    known &= np.asarray(landed.in_front)
+    return np.where(known[..., None], np.asarray(landed.pixels) - pixels, np.nan).astype(np.float32)
