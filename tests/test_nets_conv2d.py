@@ -9,7 +9,7 @@ from zestjax.nets.conv2d import convolve2d, doubled_convolve2d
 from zestjax.nets.layers import Conv, conv2d, init_conv2d
 
 
-def image_and_kernel(batch, h, w, size, n_in, n_out, dtype=np.float32):
+def image_and_kernel(batch, h, w, size, n_in, n_out, dtype: type = np.float32):
     rng = np.random.default_rng(h + 10 * w)
     return rng.normal(size=(batch, h, w, n_in)).astype(dtype), rng.normal(size=(size, size, n_in, n_out)).astype(dtype)
 
@@ -30,7 +30,7 @@ def conv2d_by_loops(x, kernel, stride):
 def test_agrees_with_loops_in_float64(x64, size, stride):
     x, kernel = image_and_kernel(2, 5, 4, size, 2, 3, np.float64)
     bias = np.arange(3.0)
-    ours = conv2d(Conv(kernel, jnp.asarray(bias)), x, stride=stride)
+    ours = conv2d(Conv(jnp.asarray(kernel), jnp.asarray(bias)), x, stride=stride)
     np.testing.assert_allclose(ours, conv2d_by_loops(x, kernel, stride) + bias, rtol=1e-12, atol=1e-12)
 
 

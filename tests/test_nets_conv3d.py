@@ -8,7 +8,7 @@ from zestjax.nets.conv3d import conv3d, conv3d_transpose
 SIZES = [(3, 4, 5, 2, 6), (5, 2, 1, 3, 2)]  # more channels out than in, and fewer; odd, even and single sizes
 
 
-def volume_and_kernel(d, h, w, n_in, n_out, dtype=np.float32):
+def volume_and_kernel(d, h, w, n_in, n_out, dtype: type = np.float32):
     rng = np.random.default_rng(d + 10 * h)
     return rng.normal(size=(d, h, w, n_in)).astype(dtype), rng.normal(size=(3, 3, 3, n_in, n_out)).astype(dtype)
 

@@ -12,22 +12,23 @@ def naive_norm_act(scale, offset, x, slope=0.01, epsilon=1e-5):
     return jnp.where(out > 0, out, slope * out)
 
 
-def sample(*shape, dtype=np.float32):
-    return np.random.default_rng(0).normal(size=shape).astype(dtype)
+def sample(*shape, dtype: type = np.float32):
+    return jnp.asarray(np.random.default_rng(0).normal(size=shape).astype(dtype))
 
 
 def test_dense_is_affine_whatever_the_batch_axes():
-    params = Dense(sample(3, 2), np.float32([1, -1]))
+    params = Dense(sample(3, 2), jnp.array([1, -1], jnp.float32))
     for shape in ((3,), (4, 3), (2, 4, 3), (0, 3)):
         x = sample(*shape)
-        np.testing.assert_allclose(dense(params, x), x @ params.kernel + params.bias, rtol=1e-6, atol=1e-6)
+        expected = np.asarray(x) @ np.asarray(params.kernel) + np.asarray(params.bias)
+        np.testing.assert_allclose(dense(params, x), expected, rtol=1e-6, atol=1e-6)
 
 
 def test_dense_gradients_are_sums_over_the_batch():
-    params, x = Dense(sample(3, 2), np.float32([1, -1])), sample(5, 4, 3)
+    params, x = Dense(sample(3, 2), jnp.array([1, -1], jnp.float32)), sample(5, 4, 3)
     grads = jax.grad(lambda p: jnp.sum(dense(p, x)))(params)
     np.testing.assert_allclose(grads.bias, [20, 20], rtol=1e-6)
-    np.testing.assert_allclose(grads.kernel, np.repeat(x.sum((0, 1))[:, None], 2, axis=1), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(grads.kernel, jnp.repeat(x.sum((0, 1))[:, None], 2, axis=1), rtol=1e-4, atol=1e-5)
 
 
 def test_initial_dense_has_the_stated_variance():
@@ -76,15 +77,15 @@ def test_mean_far_from_zero_does_not_cost_the_variance():
 
 
 def test_instance_statistics_are_each_elements_own():
-    x, params = sample(3, 4, 5, 2), Norm(np.float32([1, 2]), np.float32([0, 1]))
+    x, params = sample(3, 4, 5, 2), Norm(jnp.array([1, 2], jnp.float32), jnp.array([0, 1], jnp.float32))
     alone = jnp.concatenate([norm_act(params, x[i : i + 1]) for i in range(3)])
     np.testing.assert_allclose(norm_act(params, x, instance=True), alone, rtol=1e-5, atol=1e-6)
 
 
 def test_legacy_scale_is_the_absolute_value_plus_epsilon():
-    x, offset = sample(6, 2), np.zeros(2, np.float32)
-    legacy = norm_act(Norm(np.float32([-2, 0]), offset), x, legacy_abs=True)
-    np.testing.assert_allclose(legacy, norm_act(Norm(np.float32([2 + 1e-5, 1e-5]), offset), x), rtol=1e-5)
+    x, offset = sample(6, 2), jnp.zeros(2)
+    legacy = norm_act(Norm(jnp.array([-2, 0], jnp.float32), offset), x, legacy_abs=True)
+    np.testing.assert_allclose(legacy, norm_act(Norm(jnp.array([2 + 1e-5, 1e-5], jnp.float32), offset), x), rtol=1e-5)
 
 
 def test_faults_are_named():

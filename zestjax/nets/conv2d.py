@@ -9,8 +9,6 @@ Vocabulary:
   columns: what each tap of the kernel reads, side by side as channels.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,9 +38,7 @@ def _convolve_plain(x, kernel, stride):
     return lax.conv_general_dilated(x, kernel, (stride,) * 2, [(reach, reach)] * 2, dimension_numbers=IMAGES)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _convolve(x, kernel, stride):
-    return _convolve_plain(x, kernel, stride)
+_convolve = jax.custom_vjp(_convolve_plain, nondiff_argnums=(2,))
 
 
 def _convolve_bwd(stride, saved, d_out):
@@ -96,11 +92,7 @@ def _doubled_plain(x, kernel):
     return _convolve_plain(jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2), kernel, 1)
 
 
-@jax.custom_vjp
-def _doubled(x, kernel):
-    return _doubled_plain(x, kernel)
-
-
+_doubled = jax.custom_vjp(_doubled_plain)
 _doubled.defvjp(
     lambda x, kernel: (_doubled_plain(x, kernel), (x, kernel)),
     lambda saved, d_out: jax.vjp(_doubled_parities, *saved)[1](d_out),

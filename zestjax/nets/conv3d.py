@@ -10,8 +10,6 @@ Vocabulary:
   columns: what each tap reads of the fine volume, side by side as channels.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -73,36 +71,6 @@ def _lowering(where, lowering):
     return ("folded" if jax.default_backend() == "cpu" else "plain") if lowering == "auto" else lowering
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _conv(x, kernel, stride):
-    return _gather(x, kernel, stride)
-
-
-def _conv_bwd(stride, saved, d_out):
-    x, kernel = saved
-    if stride == 1:
-        d_x = _gather(d_out, _reverse(kernel), 1)
-    else:
-        d_x = _spread(d_out, kernel.swapaxes(3, 4))[: x.shape[0], : x.shape[1], : x.shape[2]]
-    return d_x, _kernel_gradient(x, d_out, stride)
-
-
-_conv.defvjp(lambda x, kernel, stride: (_gather(x, kernel, stride), (x, kernel)), _conv_bwd)
-
-
-@jax.custom_vjp
-def _conv_transpose(x, kernel):
-    return _spread(x, kernel)
-
-
-def _conv_transpose_bwd(saved, d_out):
-    x, kernel = saved
-    return _gather(d_out, kernel.swapaxes(3, 4), 2), _kernel_gradient(d_out, x, 2).swapaxes(3, 4)
-
-
-_conv_transpose.defvjp(lambda x, kernel: (_spread(x, kernel), (x, kernel)), _conv_transpose_bwd)
-
-
 def _reverse(kernel):
     """The kernel that takes an output's gradient back to the input of a convolution of stride 1."""
     return kernel[::-1, ::-1, ::-1].swapaxes(3, 4)
@@ -162,3 +130,25 @@ def _kernel_gradient(fine, coarse, stride):
 
     total, _ = lax.scan(plane, jnp.zeros((n_coarse, 27 * n_fine), fine.dtype), (near, coarse))
     return total.reshape(n_coarse, 3, 3, 3, n_fine).transpose(3, 1, 2, 4, 0)
+
+
+def _conv_bwd(stride, saved, d_out):
+    x, kernel = saved
+    if stride == 1:
+        d_x = _gather(d_out, _reverse(kernel), 1)
+    else:
+        d_x = _spread(d_out, kernel.swapaxes(3, 4))[: x.shape[0], : x.shape[1], : x.shape[2]]
+    return d_x, _kernel_gradient(x, d_out, stride)
+
+
+_conv = jax.custom_vjp(_gather, nondiff_argnums=(2,))
+_conv.defvjp(lambda x, kernel, stride: (_gather(x, kernel, stride), (x, kernel)), _conv_bwd)
+
+
+def _conv_transpose_bwd(saved, d_out):
+    x, kernel = saved
+    return _gather(d_out, kernel.swapaxes(3, 4), 2), _kernel_gradient(d_out, x, 2).swapaxes(3, 4)
+
+
+_conv_transpose = jax.custom_vjp(_spread)
+_conv_transpose.defvjp(lambda x, kernel: (_spread(x, kernel), (x, kernel)), _conv_transpose_bwd)

@@ -7,7 +7,6 @@ Vocabulary:
 Parameters are arrays only and float32 unless the caller casts them; what a layer is, is read off their shapes.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -164,8 +163,7 @@ def _mean(x):
     return jnp.full((x.shape[0], 1, x.shape[1]), 1 / x.shape[1], x.dtype) @ x
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _norm_act(slope, epsilon, scale, offset, x):
+def _standardise(slope, epsilon, scale, offset, x) -> jax.Array:
     return _norm_act_fwd(slope, epsilon, scale, offset, x)[0]
 
 
@@ -186,6 +184,7 @@ def _norm_act_bwd(slope, epsilon, saved, d_out):
     return d_scale.sum((0, 1)) * rows, d_offset.sum((0, 1)) * rows, d_x
 
 
+_norm_act = jax.custom_vjp(_standardise, nondiff_argnums=(0, 1))
 _norm_act.defvjp(_norm_act_fwd, _norm_act_bwd)
 
 
