@@ -58,8 +58,9 @@ def evidence_folder(folder, planes):
     return Path(folder) / f"evidence-{planes}-{code}"
 
 
+@functools.cache
 def _code(*patterns):
-    """Eight digits that change with the source files of the package that match."""
+    """Eight digits that change with the source files of the package that match; read once, as the code itself is."""
     package = Path(__file__).parents[1]
     sources = [path for pattern in patterns for path in sorted(package.glob(pattern))]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]

@@ -10,7 +10,6 @@ import io
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from zestjax.apps.evaluate import Renderer
@@ -115,7 +114,6 @@ def measure(model, scene, setting):
         seconds.append(spent)
     mean = mean_scores(scores)
     dynamic = mean["dynamic"]["psnr"] if mean["dynamic"] else None
-    jax.clear_caches()
     return {
         "psnr_full": mean["full"]["psnr"], "psnr_dynamic": dynamic, "ssim_full": mean["full"]["ssim"],
         "seconds_per_frame": float(np.median(seconds)), "peak_mb": peak_megabytes(),

@@ -83,7 +83,8 @@ def train(options):
 
 def fresh(config, options):
     """A run's first `TrainState`, from the seed or from given weights, and its compiled step."""
-    params = init_params(jax.random.key(options.seed), config)
+    with jax.threefry_partitionable(False):  # the other form of the same generator compiles ten times longer here
+        params = init_params(jax.random.key(options.seed), config)
     if options.weights is not None:
         params, _ = load_weights(options.weights, params)
     init, step_fn = make_train_step(config, steps=options.steps)

@@ -1,0 +1,103 @@
+"""The whole way, with real processes: simulate, train, be killed, resume, evaluate, render, fine-tune."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from zestjax.io.weights import load_weights
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    return tmp_path_factory.mktemp("whole")
+
+
+def start(place, *arguments):
+    environment = os.environ | {"XDG_CACHE_HOME": str(place / "cache")}
+    command = [sys.executable, "-m", "zestjax.cli", *map(str, arguments)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(place, *arguments):
+    process = start(place, *arguments)
+    out, err = process.communicate(timeout=1500)
+    assert process.returncode == 0, err
+    return out
+
+
+def training(place, name):
+    clips = ("--clips", place / "clips", "--clip-count", 2, "--steps-per-clip", 3, "--steps", 12)
+    return ("train", "--preset", "tiny", "--out", place / name, *clips, "--checkpoint-minutes", 0.0001)
+
+
+@pytest.fixture(scope="module")
+def weights(place):
+    """Weights of an uninterrupted run of the tiny preset."""
+    assert finish(place, *training(place, "whole")).startswith("train: 12 steps")
+    return place / "whole/weights.safetensors"
+
+
+@pytest.fixture(scope="module")
+def scene(place):
+    finish(place, "simulate", "--scene", "walker", "--size", "32x48", "--frames", 6, "--out", place / "scene")
+    return place / "scene"
+
+
+def test_a_killed_run_resumes_to_the_same_bits(place, weights):
+    process = start(place, *training(place, "killed"))
+    while process.poll() is None and not list((place / "killed/checkpoints").glob("step_*.safetensors")):
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    finish(place, *training(place, "killed"), "--resume")
+    (whole, _), (resumed, _) = load_weights(weights), load_weights(place / "killed/weights.safetensors")
+    assert whole.keys() == resumed.keys()
+    for name in whole:
+        np.testing.assert_array_equal(whole[name], resumed[name], err_msg=name)
+
+
+def test_the_log_has_every_loss_term(place, weights):
+    line = json.loads((weights.parent / "log.jsonl").read_text().splitlines()[-1])
+    assert {"step", "seconds", "seconds_per_step", "total", "rec"} <= line.keys() and line["step"] == 12
+
+
+def test_a_simulated_folder_is_evaluated_rendered_and_learned_from(place, weights, scene):
+    given = ("--scene", scene, "--weights", weights, "--size", "32x48")
+    finish(place, "evaluate", *given, "--targets", "2,3", "--out", place / "scores")
+    report = json.loads((place / "scores/metrics.json").read_text())
+    assert report["preset"] == "tiny" and report["mean"]["full"]["psnr"] > 5
+    assert report["mean"]["flow_epe_px"] is not None and report["mean"]["depth_abs_rel"] < 1
+    finish(place, "render", *given, "--frames", 4, "--out", place / "film")
+    assert len(list((place / "film/frames").iterdir())) == 4
+    said = finish(place, "finetune", *given, "--budget", 5, "--exclude", "1", "--out", place / "tuned")
+    assert said.startswith("finetune: ")
+    before, after = (load_weights(path)[0] for path in (weights, place / "tuned/weights.safetensors"))
+    assert any((before[name] != after[name]).any() for name in before)
+
+
+def test_a_bench_scene_is_scored_below_its_ceiling(place, weights):
+    out = place / "bench"
+    finish(
+        place,
+        "evaluate",
+        "--scene",
+        "bench:blobs",
+        "--weights",
+        weights,
+        "--size",
+        "32x48",
+        "--targets",
+        "5",
+        "--out",
+        out,
+    )
+    report = json.loads((out / "metrics.json").read_text())
+    assert report["ceiling"]["full"]["psnr"] > report["floors"]["plane_warp"]["full"]["psnr"]
