@@ -62,18 +62,3 @@ def test_only_the_edge_prints_or_reads_arguments(path):
             assert node.func.id != "print"
         if isinstance(node, ast.Import):
             assert not {"argparse", "logging", "tqdm"} & {alias.name for alias in node.names}
-
-
-def test_the_equation_index_agrees_with_the_docstrings():
-    index = ROOT / "zestjax" / "EQUATIONS.md"
-    if not index.exists():
-        pytest.skip("EQUATIONS.md is not written yet")
-    named = set(re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)`", index.read_text()))
-    missing = []
-    for name in sorted(named):
-        *parts, function = name.split(".")
-        path = ROOT / "zestjax" / "/".join(parts)
-        sources = [path.with_suffix(".py"), path / "__init__.py"]
-        if not any(s.exists() and re.search(rf"^(def|class) {function}\b", s.read_text(), re.M) for s in sources):
-            missing.append(name)
-    assert not missing
