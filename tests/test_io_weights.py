@@ -62,7 +62,7 @@ def test_weights_come_back_bit_for_bit_with_their_metadata(tmp_path, params):
     path = tmp_path / "new" / "w.safetensors"
     save_weights(path, params, metadata=CONFIG)
     for like in (params, jax.eval_shape(lambda: params)):
-        loaded, metadata = load_weights(path, like)
+        loaded, metadata = load_weights(path, like=like)
         assert_same(loaded, params)
         assert metadata == CONFIG
     assert read_metadata(path) == CONFIG
@@ -75,8 +75,8 @@ def test_the_memory_layout_of_an_array_does_not_matter(tmp_path):
         "b": np.arange(6)[::2].astype(np.int8),
     }
     save_weights(tmp_path / "w", tree, metadata={})
-    np.testing.assert_array_equal(load_weights(tmp_path / "w", tree)[0]["a"], tree["a"])
-    np.testing.assert_array_equal(load_weights(tmp_path / "w", tree)[0]["b"], [0, 2, 4])
+    np.testing.assert_array_equal(load_weights(tmp_path / "w", like=tree)[0]["a"], tree["a"])
+    np.testing.assert_array_equal(load_weights(tmp_path / "w", like=tree)[0]["b"], [0, 2, 4])
 
 
 def test_all_differences_from_the_wanted_tree_are_listed(tmp_path, params):
@@ -84,7 +84,7 @@ def test_all_differences_from_the_wanted_tree_are_listed(tmp_path, params):
     other = dict(params, static=(Layer(jnp.zeros((3, 9)), None), Layer(jnp.zeros((3, 5), jnp.float16), jnp.zeros(5))))
     other["extra"] = jnp.zeros(2)
     with pytest.raises(WeightsError) as caught:
-        load_weights(tmp_path / "w", other)
+        load_weights(tmp_path / "w", like=other)
     message = str(caught.value)
     assert "another model or preset" in message and str(tmp_path / "w") in message
     for part in (
@@ -104,7 +104,7 @@ def test_a_truncated_file_is_recognised(tmp_path, params, share):
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(DamagedFileError, match="truncated or not a safetensors file"):
-        load_weights(path, params)
+        load_weights(path, like=params)
 
 
 def test_an_altered_file_is_recognised_wherever_it_was_altered(tmp_path, params):
@@ -118,19 +118,19 @@ def test_an_altered_file_is_recognised_wherever_it_was_altered(tmp_path, params)
         assert altered != content
         path.write_bytes(altered)
         with pytest.raises(DamagedFileError, match="altered after it was written"):
-            load_weights(path, params)
+            load_weights(path, like=params)
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path, params):
     path = tmp_path / "w"
     path.write_bytes(save({"a": np.zeros(3, np.float32)}))
     with pytest.raises(DamagedFileError, match="zestjax did not write"):
-        load_weights(path, params)
+        load_weights(path, like=params)
     path.write_text(json.dumps({"a": 1}))
     with pytest.raises(DamagedFileError, match="not a safetensors file"):
-        load_weights(path, params)
+        load_weights(path, like=params)
     with pytest.raises(WeightsError, match="could not be read"):
-        load_weights(tmp_path / "absent", params)
+        load_weights(tmp_path / "absent", like=params)
 
 
 def test_a_full_disk_leaves_the_earlier_file_and_nothing_else(tmp_path, params, full_disk, monkeypatch):

@@ -50,7 +50,7 @@ def whole(tmp_path):
 def test_a_run_leaves_weights_log_curve_and_checkpoints(tmp_path, whole):
     out = tmp_path / "whole"
     assert {path.name for path in out.iterdir()} == {"weights.safetensors", "log.jsonl", "curve.png", "checkpoints"}
-    weights, metadata = load_weights(out / "weights.safetensors", toy_state().params)
+    weights, metadata = load_weights(out / "weights.safetensors", like=toy_state().params)
     np.testing.assert_array_equal(weights["w"], whole.state.params["w"])
     assert metadata["seed"] == 7 and metadata["step"] == 10
     assert [line["step"] for line in read_log(out / "log.jsonl")] == list(range(1, 11))

@@ -63,7 +63,7 @@ def frame_maps(params, evidence):
     Returns:
       `FrameMaps`.
 
-    Source: zestjax, after MODEL section 9 (1): a coarse depth and a motion mask for every input frame.
+    Source: zestjax: a coarse depth and a motion mask for every input frame.
     """
     channels = _channels(evidence)
     planes = evidence.static.shape[-1]
@@ -84,12 +84,13 @@ def plane_moments(logits, *, reach=2):
 
     Args:
       logits: (..., E).
+      reach: planes on either side of the mode that the mean is taken over.
 
     Returns:
       coordinate (...,) in [0, 1] and tolerance (...,) in plane coordinates, at least 0.7 planes.
     """
     planes = logits.shape[-1]
-    index = jnp.arange(planes, dtype=logits.dtype)
+    index = jnp.arange(planes, dtype=logits.dtype).reshape((1,) * (logits.ndim - 1) + (planes,))
     mode = jax.lax.stop_gradient(jnp.argmax(logits, axis=-1).astype(logits.dtype))
     near = jnp.abs(index - mode[..., None]) <= reach
     probability = jax.nn.softmax(jnp.where(near, logits, -1e9), axis=-1)

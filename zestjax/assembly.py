@@ -13,7 +13,7 @@ import numpy as np
 from zestjax.cameras import Camera
 from zestjax.evidence import Evidence, Sources, frame_evidence, half_images
 from zestjax.model import Frames, Inputs
-from zestjax.selection import key_frames, slots
+from zestjax.selection import Chosen, key_frames, slots
 
 EVIDENCE_SOURCES = 8
 
@@ -26,7 +26,7 @@ def positions(cameras):
 
 def taken(cameras, frames):
     """`Camera` of the chosen frames."""
-    return Camera(*(np.asarray(leaf)[frames] for leaf in cameras))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[frames], cameras)
 
 
 @functools.partial(jax.jit, static_argnames=("planes",))
@@ -48,8 +48,11 @@ def video_evidence(half, cameras, near, far, *, planes, frames=None, exclude=())
     Args:
       half: (N, 2h, 2w, 3) from `halved`.
       cameras: `Camera` (N, ...) on the host, of full-size images.
-      near, far: world units. planes: E.
-      frames: which frames, all by default. exclude: see the header.
+      near: world units.
+      far: world units.
+      planes: E.
+      frames: which frames, all by default.
+      exclude: see the header.
 
     Returns:
       `Evidence` of uint8 numpy arrays, leading axis `frames`.
@@ -58,9 +61,7 @@ def video_evidence(half, cameras, near, far, *, planes, frames=None, exclude=())
     places = positions(cameras)
     found = []
     for i in range(count) if frames is None else frames:
-        others = {i, *exclude}
-        chosen = key_frames(places, EVIDENCE_SOURCES, target=places[i], time=i, exclude=others)
-        around = slots(count, i, offsets=(-1, 1), exclude=others)
+        chosen, around = _compared(places, i, exclude)
         pack = lambda c: Sources(half[c.frames], taken(cameras, c.frames), c.valid)
         found.append(
             _evidence(
@@ -68,6 +69,15 @@ def video_evidence(half, cameras, near, far, *, planes, frames=None, exclude=())
             )
         )
     return jax.tree.map(lambda *rows: np.stack([np.asarray(r) for r in rows]), *found)
+
+
+def _compared(places, frame, exclude):
+    """`Chosen` frames that one is compared with, and its two neighbours; where none is left, itself, not valid."""
+    others = {frame, *exclude}
+    if others.issuperset(range(len(places))):
+        return tuple(Chosen(np.full(n, frame), np.zeros(n, np.float32)) for n in (EVIDENCE_SOURCES, 2))
+    chosen = key_frames(places, EVIDENCE_SOURCES, target=places[frame], time=frame, exclude=others)
+    return chosen, slots(len(places), frame, offsets=(-1, 1), exclude=others)
 
 
 def dequantised(evidence):
@@ -79,8 +89,12 @@ def target_inputs(images, cameras, near, far, camera, time, *, config, exclude=(
     """`Inputs` of a target, and which frames they hold.
 
     Args:
-      images: (N, H, W, 3) uint8 or float32, host or device. cameras: `Camera` (N, ...) on the host.
-      near, far: world units. camera: the target's `Camera`. time: int frame time.
+      images: (N, H, W, 3) uint8 or float32, host or device.
+      cameras: `Camera` (N, ...) on the host.
+      near: world units.
+      far: world units.
+      camera: the target's `Camera`.
+      time: int frame time.
       config: `presets.Config`.
       exclude: see the header.
 
@@ -88,7 +102,7 @@ def target_inputs(images, cameras, near, far, camera, time, *, config, exclude=(
       (`Inputs`, (K + M,) int frames).
     """
     count = len(images)
-    centre = positions(Camera(*(np.asarray(x)[None] for x in camera)))[0]
+    centre = positions(jax.tree.map(lambda leaf: np.asarray(leaf)[None], camera))[0]
     chosen = key_frames(
         positions(cameras), config.key_frames, target=centre, time=time, choice=config.key_frame_choice, exclude=exclude
     )

@@ -29,13 +29,13 @@ class Batch(NamedTuple):
     inputs: Inputs
     evidence: Evidence | None
     truth: Truth
-    static_planes: jax.Array
-    static_planes_valid: jax.Array
-    moving_planes: jax.Array
-    moving_planes_valid: jax.Array
-    frame_planes: jax.Array
-    frame_moving: jax.Array
-    frame_valid: jax.Array
+    static_planes: jax.Array | np.ndarray
+    static_planes_valid: jax.Array | np.ndarray
+    moving_planes: jax.Array | np.ndarray
+    moving_planes_valid: jax.Array | np.ndarray
+    frame_planes: jax.Array | np.ndarray
+    frame_moving: jax.Array | np.ndarray
+    frame_valid: jax.Array | np.ndarray
 
 
 class PreparedClip(NamedTuple):
@@ -52,7 +52,9 @@ def prepare_clip(key, clip, config):
     """Evidence of a clip, computed once; the frames in `holes` serve no other frame, as if the video lacked them.
 
     Args:
-      key: draws the holes. clip: `simulate.clips.Clip`. config: `presets.Config`.
+      key: draws the holes.
+      clip: `simulate.clips.Clip`.
+      config: `presets.Config`.
     """
     count = len(clip.images)
     holes = tuple(int(i) for i in jax.random.choice(key, count, (min(HOLES, count // 5),), replace=False))
@@ -110,7 +112,9 @@ def batch_from_clip(key, prepared, config):
     A target at the time of a hole has no slot at its own time; a hole is itself a target that no input has seen.
 
     Args:
-      key: random key. prepared: `PreparedClip`. config: `presets.Config`.
+      key: random key.
+      prepared: `PreparedClip`.
+      config: `presets.Config`.
 
     Returns:
       `Batch` of host arrays.
@@ -136,7 +140,7 @@ def batch_from_clip(key, prepared, config):
     moving = _cells(shown["moving"])
     return Batch(
         inputs, None if prepared.evidence is None else jax.tree.map(lambda x: x[frames], prepared.evidence),
-        _crop(shown, draw.integers(0, clip.images.shape[1] - config.crop_rows + 1), config),
+        _crop(shown, draw, config),
         planes(shown["static_depth"]), _cells(shown["static_valid"]).astype(np.float32),
         planes(shown["depth"]), moving.astype(np.float32),
         _cells(_planes(clip.depth[frames], clip, config.evidence_planes)), _half_mask(clip.moving[frames], cells),
@@ -163,16 +167,27 @@ def _shown(clip, kind, index):
     )  # fmt: skip
 
 
-def _crop(shown, first, config):
-    rows = slice(first, first + config.crop_rows)
-    width = shown["depth"].shape[1]
-    v, u = np.meshgrid(np.arange(first, first + config.crop_rows), np.arange(width), indexing="ij")
-    flat = lambda x: x[rows].reshape(-1, *x.shape[2:])
+def _drawn_pixels(draw, moving, config):
+    """(R,) flat indices: whole rows, or pixels drawn uniformly and more from what moves, if anything does."""
+    height, width = moving.shape
+    if config.rays == "rows":
+        first = draw.integers(0, height - config.crop_rows + 1)
+        return np.arange(first * width, (first + config.crop_rows) * width)
+    uniform = draw.choice(height * width, config.crop_rows * width, replace=False)
+    mined = np.flatnonzero(moving) if moving.any() else np.arange(height * width)
+    return np.concatenate([uniform, draw.choice(mined, config.mined_rays)])
+
+
+def _crop(shown, draw, config):
+    pixels = _drawn_pixels(draw, shown["moving"], config)
+    size = shown["depth"].shape
+    v, u = np.unravel_index(pixels, size)
+    flat = lambda x: x.reshape(-1, *x.shape[2:])[pixels]
     colour = lambda x: flat(x).astype(np.float32) / 255
     moving = flat(shown["moving"]).astype(np.float32)
     return Truth(
-        np.stack([u, v], -1).reshape(-1, 2).astype(np.float32), colour(shown["image"]), colour(shown["static"]),
+        np.stack([u, v], -1).astype(np.float32), colour(shown["image"]), colour(shown["static"]),
         flat(shown["static_valid"]).astype(np.float32), moving, flat(shown["depth"]).astype(np.float32),
-        np.moveaxis(shown["flow"][:, rows], 0, 2).reshape(-1, 2, 3).astype(np.float32),
+        flat(np.moveaxis(shown["flow"], 0, 2)).astype(np.float32),
         moving * float(shown["flow_known"]), np.full(moving.shape, float(shown["flow_known"]), np.float32),
     )  # fmt: skip

@@ -93,7 +93,9 @@ def cell_votes(samples, hom, grid, depths):
 
     Args:
       samples: (D, h, w, V, 3) moving, inverse depth and tolerance; 0 where a view does not see.
-      hom: (D, V, 3, 3). grid: (h, w, 3). depths: (D,).
+      hom: (D, V, 3, 3).
+      grid: (h, w, 3).
+      depths: (D,).
     """
     moving, surface, tolerance = samples[..., 0], samples[..., 1], samples[..., 2]
     seen = tolerance > 0
@@ -130,9 +132,12 @@ def encode_volume(params, views, camera, size, depths, *, colours, trusted, slot
     Args:
       params: `VolumeParams`.
       views: `SweepViews`.
-      camera: reference `Camera` at the volume's resolution. size: (h, w).
+      camera: reference `Camera` at the volume's resolution.
+      size: (h, w).
       depths: (D,) planes in the reference camera, world units.
-      colours, trusted, slots: as in `init_volume`.
+      colours: as in `init_volume`.
+      trusted: as in `init_volume`.
+      slots: as in `init_volume`.
 
     Returns:
       `Volume`.

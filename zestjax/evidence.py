@@ -86,12 +86,12 @@ def _warp(image, homography, grid):
 
 def static_cost(reference, sources, hom):
     """(2h, 2w) mean cost over the valid sources at one plane; hom (J, 3, 3) between half-resolution pixels."""
-    grid = _grid(*reference.shape[:2], reference.dtype)
+    grid = _grid(reference.shape[0], reference.shape[1], reference.dtype)
 
     def add(total, inputs):
         image, homography, valid = inputs
         warped, seen = _warp(image, homography, grid)
-        weight = seen * valid
+        weight = seen.astype(valid.dtype) * valid
         return (total[0] + weight * _plane_cost(reference, warped, seen), total[1] + weight), None
 
     zero = jnp.zeros(reference.shape[:2], reference.dtype)
@@ -104,7 +104,7 @@ def moving_cost(reference, before, after, hom, valid):
     height, width, _ = reference.shape
     grid = _grid(height, width, reference.dtype)
     costs = []
-    for image, homography, sign in ((before, hom[0], 1), (after, hom[1], -1)):
+    for image, homography, sign in zip((before, after), hom, (1, -1), strict=True):
         warped, seen = _warp(image, homography, grid)
         both = jnp.concatenate([warped, seen[..., None].astype(warped.dtype)], -1)
         both = jnp.pad(both, [(REACH, REACH), (REACH, REACH), (0, 0)])
@@ -124,13 +124,14 @@ def frame_evidence(image, camera, sources, neighbours, near, far, *, planes):
       camera: its `Camera`, of the full-size image.
       sources: `Sources` for the static cost.
       neighbours: `Sources` of two frames, t - 1 and t + 1.
-      near, far: () world units.
+      near: () world units.
+      far: () world units.
       planes: E.
 
     Returns:
       `Evidence`.
 
-    Source: zestjax, after MODEL section 9 (1, 2): each input frame gets its own depth and motion evidence.
+    Source: zestjax; each input frame gets evidence of its own depth and motion.
     """
     check_shapes("frame_evidence", image=(image, "P Q 3"), sources=(sources.images, "J P Q 3"),
                  neighbours=(neighbours.images, "2 P Q 3"))  # fmt: skip

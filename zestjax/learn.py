@@ -5,6 +5,8 @@ V        source frames, key-frames then slots
 A step's gradient is summed over blocks of rays inside the loop, and the volumes are computed once.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -54,6 +56,14 @@ def scene_terms(maps, encoded, batch, weights):
     return measured(measures, None, batch, _only(weights, SCENE_TERMS))
 
 
+def _blocks(truth, count):
+    """`Truth` of R rays as (count, R / count, ...)."""
+    rays = truth.pixels.shape[0]
+    if rays % count:
+        raise ValueError(f"train_step: a crop of {rays} rays has no {count} equal blocks; change `ray_blocks`.")
+    return jax.tree.map(lambda x: x.reshape(count, -1, *x.shape[1:]), truth)
+
+
 def _only(weights, names):
     return Terms(**{name: getattr(weights, name) for name in names})
 
@@ -62,8 +72,12 @@ def make_train_step(config, *, steps, weights=FRAME_WEIGHTS, peak=2e-3, floor=2e
     """A run's solver and its compiled step.
 
     Args:
-      config: `presets.Config`. weights: `Terms`.
-      steps: length of the cosine schedule; peak, floor, warmup: its learning rates and rise.
+      config: `presets.Config`.
+      steps: length of the cosine schedule.
+      weights: `Terms`, see `train_step`.
+      peak: the schedule's highest learning rate.
+      floor: its last one.
+      warmup: steps of its rise.
 
     Returns:
       (init(params) -> opt_state, step(params, opt_state, batch) -> (params, opt_state, {name: value})); the step
@@ -84,44 +98,25 @@ def train_step(config, *, weights=FRAME_WEIGHTS, solver):
       solver: `solve.Adam` (or anything with its `apply`).
 
     Returns:
-      `step(params, opt_state, batch) -> (params, opt_state, terms)`, pure; jit it with donated arguments.
+      `step(params, opt_state, batch) -> (params, opt_state, terms)`, pure; jit it with donated arguments. The objective
+      is the mean over the blocks of rays of each block's own. It raises `ValueError` if the rays cannot be shared
+      evenly among `config.ray_blocks`.
     """
-    terms_of_rays = _only(weights, RAY_TERMS if config.dynamic else ("rec",))
-
-    def scene(params, batch):
-        maps = None
-        if params.analysis is not None:
-            maps = frame_maps(params.analysis, dequantised(batch.evidence))
-        encoded = volumes(params, batch.inputs, maps, config=config)
-        guided = all(v is None or v.logits is not None for v in encoded)
-        known = [n for n in SCENE_TERMS if (n == "depth_ce" and guided) or (n != "depth_ce" and maps is not None)]
-        terms = scene_terms(maps, encoded, batch, _only(weights, known))
-        return (encoded, weighted_sum(terms, _only(weights, known))), (maps, terms)
-
-    def rays(params, encoded, tables, inputs, truth):
-        encoding = Encoding(*encoded, *tables[:2], reference_frustum(inputs, config), tables[2])
-        prediction = render_rays(params, encoding, inputs, truth.pixels, config=config)
-        measures = make_measures(params, encoding, inputs, config=config)
-        terms = measured(measures, prediction, truth, terms_of_rays)
-        return weighted_sum(terms, terms_of_rays), terms
+    of_rays = _only(weights, RAY_TERMS if config.dynamic else ("rec",))
+    rays = functools.partial(_rays, config=config, weights=of_rays)
 
     def step(params, opt_state, batch):
-        (encoded, _), pull, (maps, terms) = jax.vjp(lambda p: scene(p, batch), params, has_aux=True)
+        scene = lambda p: _scene(p, batch, config=config, weights=weights)
+        (encoded, _), pull, (maps, terms) = jax.vjp(scene, params, has_aux=True)
         encoding = jax.lax.stop_gradient(assemble(batch.inputs, maps, encoded, config=config))
         tables = (encoding.key, encoding.slots, encoding.guides)
-        blocks = jax.tree.map(lambda x: x.reshape(config.ray_blocks, -1, *x.shape[1:]), batch.truth)
         gradient = jax.value_and_grad(rays, argnums=(0, 1), has_aux=True)
 
-        def block(carry, truth):
+        def of_block(truth):
             (_, found), grads = gradient(params, encoded, tables, batch.inputs, truth)
-            return jax.tree.map(jnp.add, carry, (found, grads)), None
+            return found, grads
 
-        shapes = jax.eval_shape(gradient, params, encoded, tables, batch.inputs, jax.tree.map(lambda x: x[0], blocks))
-        zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), (shapes[0][1], shapes[1]))
-        (found, (towards_params, towards_encoded)), _ = jax.lax.scan(block, zeros, blocks)
-        found, towards_params, towards_encoded = jax.tree.map(
-            lambda x: x / config.ray_blocks, (found, towards_params, towards_encoded)
-        )
+        found, (towards_params, towards_encoded) = mean_over_blocks(of_block, _blocks(batch.truth, config.ray_blocks))
         (through,) = pull((towards_encoded, jnp.ones(())))
         grads = jax.tree.map(jnp.add, towards_params, through)
         terms = Terms(*(a if a is not None else b for a, b in zip(terms, found, strict=True)))
@@ -130,3 +125,33 @@ def train_step(config, *, weights=FRAME_WEIGHTS, solver):
         return params, opt_state, terms._asdict() | {"total": total}
 
     return step
+
+
+def _scene(params, batch, *, config, weights):
+    """((volumes, weighted loss of what needs no ray), (maps, its terms))."""
+    maps = None
+    if params.analysis is not None:
+        maps = frame_maps(params.analysis, dequantised(batch.evidence))
+    encoded = volumes(params, batch.inputs, maps, config=config)
+    guided = all(v is None or v.logits is not None for v in encoded)
+    known = [n for n in SCENE_TERMS if (n == "depth_ce" and guided) or (n != "depth_ce" and maps is not None)]
+    terms = scene_terms(maps, encoded, batch, _only(weights, known))
+    return (encoded, weighted_sum(terms, _only(weights, known))), (maps, terms)
+
+
+def _rays(params, encoded, tables, inputs, truth, *, config, weights):
+    """(weighted loss of a block of rays, its terms)."""
+    (geometry, motion), (key, slots, guides) = encoded, tables
+    encoding = Encoding(geometry, motion, key, slots, reference_frustum(inputs, config), guides)
+    prediction = render_rays(params, encoding, inputs, truth.pixels, config=config)
+    terms = measured(make_measures(params, encoding, inputs, config=config), prediction, truth, weights)
+    return weighted_sum(terms, weights), terms
+
+
+def mean_over_blocks(fn, blocks):
+    """Mean of a tree-valued function over the leading axis of `blocks`, summed inside the loop: one block in memory."""
+    count = jax.tree.leaves(blocks)[0].shape[0]
+    shapes = jax.eval_shape(fn, jax.tree.map(lambda x: x[0], blocks))
+    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    total, _ = jax.lax.scan(lambda carry, block: (jax.tree.map(jnp.add, carry, fn(block)), None), zeros, blocks)
+    return jax.tree.map(lambda x: x / count, total)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zestjax.cameras import project, unproject
 from zestjax.flow import optical_flow, world_flow
@@ -33,15 +34,15 @@ class Truth(NamedTuple):
     depth: (R,) world units. flow: (R, 2, 3) world, to the next and previous time. flow_valid: (R,) 1 or 0, the flow is
     known and not nothing. known: (R,) 1 or 0, depth and flow are known at all."""
 
-    pixels: jax.Array
-    colour: jax.Array
-    static: jax.Array
-    static_valid: jax.Array
-    moving: jax.Array
-    depth: jax.Array
-    flow: jax.Array
-    flow_valid: jax.Array
-    known: jax.Array
+    pixels: jax.Array | np.ndarray
+    colour: jax.Array | np.ndarray
+    static: jax.Array | np.ndarray
+    static_valid: jax.Array | np.ndarray
+    moving: jax.Array | np.ndarray
+    depth: jax.Array | np.ndarray
+    flow: jax.Array | np.ndarray
+    flow_valid: jax.Array | np.ndarray
+    known: jax.Array | np.ndarray
 
 
 class Warped(NamedTuple):
@@ -74,7 +75,7 @@ def warped(params, encoding, inputs, prediction, *, config, chain=False):
     Returns:
       `Warped`. A neighbour that does not exist is not valid and counts in nothing.
 
-    Source: ZeST-NeRF eq. 11 to eq. 13.
+    Source: ZeST-NeRF eq. 11, eq. 12, eq. 13.
     """
     marched, here = prediction.marched, prediction.dynamic
     world = functools.partial(world_from_frustum, encoding.frustum, spacing=config.spacing)
@@ -88,8 +89,9 @@ def warped(params, encoding, inputs, prediction, *, config, chain=False):
             confidence = confidence * (sample.confidence_forward if sign > 0 else sample.confidence_backward)
             moved = coords + flow
             time = inputs.time + sign * step
+            there_then = _seen_from(encoding, sign * step)
             after = query_dynamic(
-                params, encoding, moved.reshape(-1, 3), directions, time, inputs.duration, config=config
+                params, there_then, moved.reshape(-1, 3), directions, time, inputs.duration, config=config
             )
             after = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), after)
             exists = exists * slot_valid(encoding_slots(inputs), sign * step)
@@ -103,6 +105,13 @@ def warped(params, encoding, inputs, prediction, *, config, chain=False):
                 back.append(world_flow(world, moved, reverse))
             coords, sample = moved, after
     return Warped(*(jnp.stack(x) for x in (colours, certain, valid, there, back)))
+
+
+def _seen_from(encoding, offset):
+    """The encoding with its slots' times relative to a time `offset` frames after the target's."""
+    if encoding.slots is None:
+        return encoding
+    return encoding._replace(slots=encoding.slots._replace(times=encoding.slots.times - offset))
 
 
 def encoding_slots(inputs):
@@ -132,17 +141,10 @@ def make_measures(params, encoding, inputs, *, config, chain=False):
             memo["warped"] = warped(params, encoding, inputs, prediction, config=config, chain=chain)
         return memo["warped"]
 
-    world = functools.partial(world_from_frustum, encoding.frustum, spacing=config.spacing)
     slots = encoding_slots(inputs)
     exists = jnp.stack([slot_valid(slots, sign) for sign in DIRECTIONS])
-
-    def flows(prediction):
-        """(2, R, S, 3) world units."""
-        coords, dynamic = prediction.marched.coords, prediction.dynamic
-        return jnp.stack([world_flow(world, coords, f) for f in (dynamic.flow_forward, dynamic.flow_backward)])
-
-    def confidences(prediction):
-        return jnp.stack([prediction.dynamic.confidence_forward, prediction.dynamic.confidence_backward])
+    flows = functools.partial(world_flows, frustum=encoding.frustum, spacing=config.spacing)
+    both_exist = exists[0] * exists[1]
 
     def pho(prediction, truth):
         found = followed(prediction)
@@ -152,23 +154,9 @@ def make_measures(params, encoding, inputs, *, config, chain=False):
         found = followed(prediction)
         return cycle_loss(found.there, found.back, confidences(prediction), valid=exists)
 
-    def temp(prediction, truth):
-        forward, backward = flows(prediction)
-        both = jnp.broadcast_to(exists[0] * exists[1], forward.shape[:1])
-        return temporal_loss(forward, backward, valid=both)
-
-    def flow3d(prediction, truth):
-        marched = prediction.marched
-        weight = jnp.exp(-jnp.square((marched.depths / truth.depth[:, None] - 1) / NEAR_SURFACE))
-        weight = jax.lax.stop_gradient(weight) * truth.flow_valid[:, None]
-        error = (
-            jnp.abs(flows(prediction) - jnp.moveaxis(truth.flow, 1, 0)[:, :, None]) / truth.depth[None, :, None, None]
-        )
-        each = [mean_over_valid("flow3d", jnp.minimum(e, 1.0), valid=weight) for e in error]
-        return 5 * (each[0] + each[1])
-
-    def geo(prediction, truth):
-        return _geometric(prediction, truth, inputs, slots, flows(prediction))
+    def sp(prediction, truth):
+        points = prediction.marched.points
+        return spatial_smoothness_loss(flows(prediction), jnp.broadcast_to(points, (2, *points.shape)), valid=exists)
 
     return Terms(
         rec=lambda p, t: reconstruction_loss(p.colour, t.colour),
@@ -177,12 +165,34 @@ def make_measures(params, encoding, inputs, *, config, chain=False):
         b=lambda p, t: blend_entropy_loss(p.blend),
         w=lambda p, t: disocclusion_loss(confidences(p), valid=exists),
         min=lambda p, t: minimum_flow_loss(flows(p), valid=exists),
-        sp=lambda p, t: spatial_smoothness_loss(
-            flows(p), jnp.broadcast_to(p.marched.points, (2, *p.marched.points.shape)), valid=exists
-        ),
+        temp=lambda p, t: temporal_loss(*flows(p), valid=jnp.broadcast_to(both_exist, p.depth.shape)),
         depth=lambda p, t: depth_loss(-1 / p.depth_of_dynamic, -1 / t.depth, valid=t.known),
-        pho=pho, cyc=cyc, temp=temp, flow3d=flow3d, geo=geo,
+        flow3d=lambda p, t: _surface_flow(flows(p), p, t),
+        geo=lambda p, t: _geometric(p, t, inputs, slots, flows(p)),
+        pho=pho, cyc=cyc, sp=sp,
     )  # fmt: skip
+
+
+def world_flows(prediction, *, frustum, spacing):
+    """(2, R, S, 3) scene flow of every sample in `DIRECTIONS`, world units."""
+    world = functools.partial(world_from_frustum, frustum, spacing=spacing)
+    coords, dynamic = prediction.marched.coords, prediction.dynamic
+    return jnp.stack([world_flow(world, coords, flow) for flow in (dynamic.flow_forward, dynamic.flow_backward)])
+
+
+def confidences(prediction):
+    """(2, R, S) confidence in `DIRECTIONS`."""
+    return jnp.stack([prediction.dynamic.confidence_forward, prediction.dynamic.confidence_backward])
+
+
+def _surface_flow(flows, prediction, truth):
+    """Scene flow of the samples at the true surface, against the truth, as a share of the depth; ten times that."""
+    depth = jnp.where(truth.flow_valid > 0, truth.depth, 1)
+    weight = jnp.exp(-jnp.square((prediction.marched.depths / depth[:, None] - 1) / NEAR_SURFACE))
+    weight = jax.lax.stop_gradient(weight) * truth.flow_valid[:, None]
+    error = jnp.abs(flows - jnp.moveaxis(truth.flow, 1, 0)[:, :, None]) / depth[None, :, None, None]
+    each = [mean_over_valid("flow3d", jnp.minimum(e, 1.0), valid=weight) for e in error]
+    return 5 * (each[0] + each[1])
 
 
 def _geometric(prediction, truth, inputs, slots, flows):

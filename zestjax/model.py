@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zestjax.analysis import AnalysisParams, init_analysis, plane_moments
 from zestjax.cameras import Camera, resized, scaled
@@ -51,10 +52,10 @@ class Inputs(NamedTuple):
     key: Frames
     slots: Frames
     camera: Camera
-    time: jax.Array
-    duration: jax.Array
-    near: jax.Array
-    far: jax.Array
+    time: jax.Array | np.floating
+    duration: jax.Array | np.floating
+    near: jax.Array | np.floating
+    far: jax.Array | np.floating
 
 
 class Encoding(NamedTuple):
@@ -103,9 +104,10 @@ def init_params(key, config):
 
     slots = len(config.slots)
     motion = config.motion and config.dynamic
-    analysis = init_analysis(keys[0], planes=config.evidence_planes, features=config.features, widths=config.frame_widths)
+    analysed = frames and (config.geometry or motion)
+    sizes = dict(planes=config.evidence_planes, features=config.features, widths=config.frame_widths)
     return ZestParams(
-        analysis if frames and (config.geometry or motion) else None,
+        init_analysis(keys[0], **sizes) if analysed else None,
         volume(keys[1], config.key_frames, False) if config.geometry else None,
         volume(keys[2], slots, True) if motion else None,
         field(keys[3], init_static, config.geometry, config.key_frames, 3),
@@ -151,15 +153,14 @@ def _source_views(frames, maps, time, near, far, config):
         maps = jax.lax.stop_gradient(maps)
         depth = _inverse_depth(maps.coordinate, near, far)
         tolerance = maps.tolerance * (1 / near - 1 / far)
-        channels = [jax.nn.sigmoid(maps.moving_logits), depth, tolerance]
-        grown = [_grown(x, size[1:]) for x in channels]
+        moving = _grown(jax.nn.sigmoid(maps.moving_logits), size[1:], factor=2)
+        grown = [moving, *(_grown(x, size[1:], factor=4) for x in (depth, tolerance))]
         tables = jnp.concatenate([tables, jnp.stack(grown, -1)], axis=-1)
     return SourceViews(tables, frames.cameras, frames.valid, frames.times - time)
 
 
-def _grown(x, size):
-    """(V, h, w) maps to image size (H, W): linear between cell centres, cells being 2 or 4 pixels wide."""
-    factor = -(-size[0] // x.shape[1])
+def _grown(x, size, *, factor):
+    """(V, h, w) maps to image size (H, W): linear between cell centres, cells being `factor` pixels wide."""
     grown = jax.image.resize(x, (x.shape[0], factor * x.shape[1], factor * x.shape[2]), "linear")
     return grown[:, : size[0], : size[1]]
 

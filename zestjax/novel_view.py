@@ -14,7 +14,7 @@ import numpy as np
 
 from zestjax.analysis import FrameMaps, frame_maps
 from zestjax.assembly import dequantised, halved, target_inputs, video_evidence
-from zestjax.cameras import Camera, project
+from zestjax.cameras import project
 from zestjax.frustum import world_from_frustum
 from zestjax.model import encode
 from zestjax.prediction import render_rays
@@ -53,10 +53,12 @@ def _maps(params, evidence):
 
 
 def _frame_maps(params, half, video, config, *, frames=None, exclude=()):
+    """`FrameMaps` of all frames or of those named, whose evidence is found once each."""
+    used, place = (None, None) if frames is None else np.unique(frames, return_inverse=True)
     evidence = video_evidence(
-        half, video.cameras, video.near, video.far, planes=config.evidence_planes, frames=frames, exclude=exclude
+        half, video.cameras, video.near, video.far, planes=config.evidence_planes, frames=used, exclude=exclude
     )
-    return _maps(params.analysis, evidence)
+    return _maps(params.analysis, evidence if place is None else jax.tree.map(lambda x: x[place], evidence))
 
 
 def prepare(params, video, *, config):
@@ -70,7 +72,7 @@ def prepare(params, video, *, config):
     Returns:
       `Prepared`.
     """
-    video = Video(np.asarray(video.images), Camera(*map(np.asarray, video.cameras)), video.near, video.far)
+    video = video._replace(images=np.asarray(video.images), cameras=jax.tree.map(np.asarray, video.cameras))
     if params.analysis is None:
         return Prepared(video, None, None)
     half = halved(jnp.asarray(video.images))
@@ -97,26 +99,35 @@ def render_view(params, prepared, camera, time, *, config, exclude=()):
     )
     maps = prepared.maps
     if maps is not None and len(exclude):
-        used, place = np.unique(frames, return_inverse=True)
-        used = np.resize(used, len(frames))  # one length for every target: one program
-        maps = _frame_maps(params, prepared.half, video, config, frames=[int(f) for f in used], exclude=exclude)
-        frames = place
-    if maps is not None:
+        maps = _frame_maps(params, prepared.half, video, config, frames=frames, exclude=exclude)
+    elif maps is not None:
         maps = jax.tree.map(lambda x: x[frames], maps)
     return render_inputs(params, inputs, maps, config=config)
 
 
-@functools.partial(jax.jit, static_argnames=("config",))
-def render_inputs(params, inputs, maps, *, config):
-    """`View` of `model.Inputs` and the frames' maps; a pure function, compiled once for a size and a configuration."""
+@functools.partial(jax.jit, static_argnames=("config", "rows"))
+def render_inputs(params, inputs, maps, *, config, rows=None):
+    """The view of given inputs; a pure function, compiled once for a size and a configuration.
+
+    Args:
+      params: `model.ZestParams`.
+      inputs: `model.Inputs`.
+      maps: `FrameMaps` of the inputs' frames, or None.
+      config: `presets.Config`.
+      rows: how many of the first rows to render, all by default.
+
+    Returns:
+      `View`.
+    """
     encoding = encode(params, inputs, maps, config=config)
     height, width = inputs.key.images.shape[1:3]
-    rows = -(-height // BLOCK_ROWS)
-    pixels = pixel_grid(rows * BLOCK_ROWS, width).reshape(rows, -1, 2)
+    height = height if rows is None else rows
+    together = min(BLOCK_ROWS, height)
+    blocks = -(-height // together)
+    pixels = pixel_grid(blocks * together, width).reshape(blocks, -1, 2)
     block = lambda p: _view_block(render_rays(params, encoding, inputs, p, config=config), encoding, inputs, p, config)
-    blocks = jax.lax.map(block, pixels)
-    image = lambda x: x.reshape(rows * BLOCK_ROWS, width, *x.shape[2:])[:height]
-    view = jax.tree.map(image, blocks)
+    image = lambda x: x.reshape(blocks * together, width, *x.shape[2:])[:height]
+    view = jax.tree.map(image, jax.lax.map(block, pixels))
     shown = lambda x: None if x is None else jnp.clip(x, 0, 1)
     return view._replace(colour=shown(view.colour), static=shown(view.static), dynamic=shown(view.dynamic))
 

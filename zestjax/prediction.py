@@ -2,8 +2,8 @@
 
 R S      rays and samples on a ray; P = R S points, ray by ray
 coords   (R, S, 3) in the frustum of the volumes, z in [0, 1]
-lengths  (R, S) what a sample stands for: with guided sampling one plane, so that densities are per plane;
-         with regular sampling its interval, world units
+lengths  (R, S) what a sample stands for. Where the volumes guide, densities are per plane: a guided sample stands for
+         one plane, a regular one for its interval in planes. Elsewhere it is its interval, world units
 """
 
 from typing import NamedTuple
@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.depth import expected_depth
 from zestjax.fields.conditioning import parallax, sample_views
 from zestjax.fields.dynamic import DynamicSample, dynamic_field, dynamic_views, early_flow
 from zestjax.fields.static import static_field, static_views
@@ -22,6 +23,7 @@ from zestjax.rays import depths_from_fractions, interval_lengths, rays_from_pixe
 from zestjax.rendering import FieldSamples, composite, render_blended, weights_from_density
 from zestjax.resample import trilinear
 
+FARTHEST = 1e6  # of far, as good as infinity
 FLOW_REACH = {"guided": 0.15, "regular": 1.0}
 
 
@@ -74,8 +76,9 @@ def guided_coordinates(guides, pixels):
     """
     height, width = guides.shape[1:]
     place = (pixels - CELL_OFFSET) / 4
-    base = jnp.clip(jnp.floor(place), 0, jnp.array([max(width - 2, 0), max(height - 2, 0)], place.dtype))
-    across, down = jnp.moveaxis(jnp.clip(place - base, 0, 1), -1, 0)
+    last = jnp.array([[max(width - 2, 0), max(height - 2, 0)]], place.dtype)
+    base = jnp.clip(jnp.floor(place), 0, last)
+    across, down = jnp.moveaxis(jnp.clip(place - base, 0, 1), -1, 0)[:, None]
     column, row = jnp.moveaxis(base.astype(jnp.int32), -1, 0)
     right, below = jnp.minimum(column + 1, width - 1), jnp.minimum(row + 1, height - 1)
     corner = lambda r, c: guides[:, r, c]
@@ -89,7 +92,9 @@ def march(encoding, camera, near, far, pixels, *, config, jitter=None):
 
     Args:
       encoding: `model.Encoding`.
-      camera: the target's `Camera`. near, far: () world units.
+      camera: the target's `Camera`.
+      near: () world units.
+      far: () world units.
       pixels: (R, 2).
       config: `presets.Config`.
       jitter: (R, S) in [0, 1) places of regular samples in their strata, or None for the middles.
@@ -105,11 +110,17 @@ def march(encoding, camera, near, far, pixels, *, config, jitter=None):
         fractions = (jnp.arange(config.samples, dtype=pixels.dtype)[None] + place) / config.samples
     depths = depths_from_fractions(fractions, near, far, spacing=config.spacing)
     farther = depths_from_fractions(fractions + 1 / max(config.planes - 1, 1), near, far * 1.5, spacing=config.spacing)
+    farther = jnp.clip(farther, -FARTHEST * far, FARTHEST * far)  # one plane past the last may be at infinity
     along = lambda z: rays.origins[:, None] + z[..., None] * rays.directions[:, None]
     points = along(depths)
     coords = frustum_from_world(encoding.frustum, points, spacing=config.spacing)
     norm = jnp.sqrt(jnp.sum(rays.directions**2, axis=-1, keepdims=True))
-    lengths = jnp.ones_like(depths) if encoding.guides is not None else interval_lengths(depths, near, far) * norm
+    if encoding.guides is not None:
+        lengths = jnp.ones_like(depths)
+    elif any(v is not None and v.logits is not None for v in (encoding.geometry, encoding.motion)):
+        lengths = interval_lengths(fractions, 0.0, 1.0) * (config.planes - 1)
+    else:
+        lengths = interval_lengths(depths, near, far) * norm
     rotation = encoding.frustum.camera.camera_from_world[:3, :3]
     return Marched(depths, coords, points, along(farther), lengths, matvec(rotation, rays.directions / norm))
 
@@ -154,7 +165,10 @@ def query_dynamic(params, encoding, coords, directions, time, duration, *, confi
     Args:
       params: `ZestParams`.
       encoding: `model.Encoding`.
-      coords: (P, 3). directions: (P, Q) encoded. time: () frame time. duration: () frames of the video.
+      coords: (P, 3).
+      directions: (P, Q) encoded.
+      time: () frame time.
+      duration: () frames of the video.
       config: `presets.Config`.
 
     Reference: ZeST-NeRF networks.py; time is normalised to [-1, 1) over the video.
@@ -197,7 +211,7 @@ def render_rays(params, encoding, inputs, pixels, *, config, jitter=None):
     Returns:
       `Prediction`.
 
-    Source: ZeST-NeRF eq. 5 to eq. 9.
+    Source: ZeST-NeRF eq. 6, eq. 7, eq. 8, eq. 9.
     """
     marched = march(encoding, inputs.camera, inputs.near, inputs.far, pixels, config=config, jitter=jitter)
     rays, samples = marched.depths.shape
@@ -205,7 +219,7 @@ def render_rays(params, encoding, inputs, pixels, *, config, jitter=None):
     still = jax.tree.map(grid, query_static(params, encoding, marched, config=config))
     static = FieldSamples(still.density, still.colour)
     if params.dynamic is None:
-        return _static_prediction(static, marched)
+        return _static_prediction(static, marched, filled=encoding.guides is not None)
     moving = query_dynamic(
         params,
         encoding,
@@ -230,11 +244,10 @@ def render_rays(params, encoding, inputs, pixels, *, config, jitter=None):
     )  # fmt: skip
 
 
-def _static_prediction(static, marched):
+def _static_prediction(static, marched, *, filled):
+    """The `Prediction` of a scene in which nothing moves; `filled` where rays that see nothing show a last resort."""
     weights = weights_from_density(static.density, marched.lengths)
-    shown = composite(weights, {"colour": static.colour, "depth": marched.depths[..., None]})
-    opacity = shown.opacity
-    colour = shown.values["colour"] + (1 - opacity)[:, None] * last_resort(static)
-    depth = shown.values["depth"][:, 0] / jnp.maximum(opacity, 1e-6)
-    none = jnp.zeros_like(opacity)
-    return Prediction(colour, colour, None, depth, None, opacity, none, None, weights, None, None, None, marched)
+    shown = composite(weights, static.colour, background=last_resort(static) if filled else None)
+    depth, none = expected_depth(weights, marched.depths), jnp.zeros_like(shown.opacity)
+    colour = shown.values
+    return Prediction(colour, colour, None, depth, None, shown.opacity, none, None, weights, None, None, None, marched)

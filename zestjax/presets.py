@@ -23,6 +23,8 @@ class Config:
       dynamic branch is compiled). trust: source views are tested before they count;
       hold_trust: the frames' own maps learn from their own losses alone, which halves the sweep's cost.
     sampling: `guided` by the volumes' depth modes, or `regular`; samples: per ray, of `regular`.
+    rays: of a training step, whole `rows` (crop_rows of them) or as many pixels drawn `uniform`ly, and mined_rays more
+      from what moves. ray_blocks: parts in which they are computed.
     head: `blend` of the views' colours or `direct`. blend: `opacity` or `density` form of the two fields' sum.
     """
 
@@ -54,6 +56,8 @@ class Config:
     head: str = "blend"
     conditioning: str = "pooled"
     blend: str = "opacity"
+    rays: str = "rows"
+    mined_rays: int = 0
     crop_rows: int = 16
     ray_blocks: int = 4
 
@@ -65,10 +69,28 @@ class Config:
             key_frame_choice=(self.key_frame_choice, ("nearest", "spread")),
             reference=(self.reference, ("target", "key_frame")),
             sampling=(self.sampling, ("guided", "regular")),
+            rays=(self.rays, ("rows", "uniform")),
             head=(self.head, ("blend", "direct")),
             conditioning=(self.conditioning, ("pooled", "concatenated")),
             blend=(self.blend, ("opacity", "density")),
         )
+        self._check_together()
+
+    def _check_together(self):
+        """Choices that only work together; raises `ValueError`."""
+        frames = self.encoder == "frames"
+        if (self.head == "blend") != (self.conditioning == "pooled") or (self.head == "blend") != frames:
+            raise ValueError(
+                f"Config: encoder `{self.encoder}`, head `{self.head}`, conditioning `{self.conditioning}` do not fit "
+                "together; expected `frames`, `blend`, `pooled` or `pyramid`, `direct`, `concatenated`."
+            )
+        if self.sampling == "guided" and (self.reference != "target" or not frames):
+            raise ValueError(
+                f"Config: guided sampling with encoder `{self.encoder}` and reference `{self.reference}`; "
+                "expected `frames` and `target`, or sampling `regular`."
+            )
+        if min(self.planes, self.evidence_planes) < 2:
+            raise ValueError(f"Config: {self.planes} planes, {self.evidence_planes} of evidence; expected at least 2.")
 
 
 PRESETS = {
@@ -81,7 +103,8 @@ PRESETS = {
         "paper", height=288, width=512, planes=128, spacing="depth", encoder="pyramid", features=32,
         volume_widths=(8, 16, 32, 64), key_frame_choice="spread", slots=(-2, -1, 1, 2), reference="key_frame",
         trust=False, field_width=256, field_depth=8, point_levels=10, view_levels=4, sampling="regular",
-        samples=128, head="direct", conditioning="concatenated",
+        samples=128, head="direct", conditioning="concatenated", rays="uniform", mined_rays=512,
+        crop_rows=2, ray_blocks=8,
     ),
 }  # fmt: skip
 

@@ -38,7 +38,7 @@ def _spread_ranks(count, available):
 def key_frames(positions, count, *, target=None, time=0, choice="nearest", exclude=()):
     """The key-frames of a target.
 
-    Source: ZeST-NeRF section 3.1 (`spread`); `nearest` after MODEL section 9 (4).
+    Source: ZeST-NeRF section 3.1 (`spread`).
 
     Args:
       positions: (N, 3) camera centres.

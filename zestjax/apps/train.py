@@ -9,7 +9,7 @@ import jax
 
 import zestjax
 from zestjax.apps.clips import EVIDENCE, ClipSource, ClipSpec, clip_folder, hole_key
-from zestjax.apps.loop import LoopOptions, run_loop
+from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.weights import SYSTEMS
 from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, prepare_clip
 from zestjax.checks import check_option
@@ -56,7 +56,7 @@ class Summary(NamedTuple):
 
     line: str
     weights: Path
-    result: object
+    result: LoopResult
 
 
 def train(options):
@@ -86,7 +86,7 @@ def fresh(config, options):
     with jax.threefry_partitionable(False):  # the other form of the same generator compiles ten times longer here
         params = init_params(jax.random.key(options.seed), config)
     if options.weights is not None:
-        params, _ = load_weights(options.weights, params)
+        params, _ = load_weights(options.weights, like=params)
     init, step_fn = make_train_step(config, steps=options.steps)
     return TrainState(params, init(params), 0), step_fn
 

@@ -44,7 +44,8 @@ def config_from_json(fields):
     known = {field.name for field in dataclasses.fields(Config)}
     if unknown := sorted(fields.keys() - known):
         raise WeightsError(f"the configuration has fields that this version does not know: {', '.join(unknown)}")
-    return Config(**{name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()})
+    values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
+    return Config(**values)
 
 
 def system_of(config):
@@ -76,5 +77,5 @@ def open_weights(path=None, *, system=None):
     if system is not None and system != found:
         raise WeightsError(f"{path}: holds weights of `{found}`, not `{system}`; train them with --system {system}.")
     like = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
-    params, _ = load_weights(path, like)
+    params, _ = load_weights(path, like=like)
     return Model(params, config, found, path, metadata)

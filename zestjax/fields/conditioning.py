@@ -6,6 +6,8 @@ gap      how far a view's own surface lies in front of the point, in its toleran
          about 0 it is that surface, < 0 the view looks through it
 """
 
+import functools
+import operator
 from typing import NamedTuple
 
 import jax
@@ -88,9 +90,14 @@ def over_views(weights, values):
     Written as a sum of products: sums over a leading axis are slow on a CPU.
     """
     views = range(weights.shape[0])
-    total = sum(weights[v] for v in views)
-    summed = sum(weights[v][None] * values[v] for v in views)
+    total = added(weights[v] for v in views)
+    summed = added(weights[v][None] * values[v] for v in views)
     return jax.lax.optimization_barrier(safe_divide(summed, total[None]))
+
+
+def added(arrays):
+    """The sum of one array or more of one shape."""
+    return functools.reduce(operator.add, arrays)
 
 
 def parallax(cameras, points, points_beyond):

@@ -116,7 +116,8 @@ def dynamic_field(params, point, direction, volume, samples, views, *, reach=1.0
 
     Args:
       params: `DynamicParams`.
-      point: (P, n) encoded position and time. direction: (P, Q) encoded.
+      point: (P, n) encoded position and time.
+      direction: (P, Q) encoded.
       volume: (P, C) looked up in the motion volume; C may be 0.
       samples: `ViewSamples` of the slots, or None without them.
       views: `DynamicViews` for a blend head, or None: colours and visibility are then concatenated.
@@ -127,14 +128,14 @@ def dynamic_field(params, point, direction, volume, samples, views, *, reach=1.0
     Returns:
       `DynamicSample`.
 
-    Source: ZeST-NeRF eq. 4.
+    Source: ZeST-NeRF eq. 5.
     Differs from the reference: with a blend head colours come from the neighbours at the point's displaced position.
     """
-    if views is not None:
-        lift = lifted(params.views, views.features)
-        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
-    else:
+    lift = None if views is None else lifted(params.views, views.features)
+    if views is None:
         condition = concatenated(volume, samples)
+    else:
+        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
     state = trunk(params.trunk, point, condition, conditioning=conditioning)
     if views is not None:
         scores = view_scores(params.views, lift, state)

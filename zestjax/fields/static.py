@@ -8,8 +8,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.fields.conditioning import added, on_surface, over_views
 from zestjax.fields.conditioning import hidden as hidden_behind
-from zestjax.fields.conditioning import on_surface, over_views
 from zestjax.fields.trunk import (
     ColourHead,
     Trunk,
@@ -101,8 +101,8 @@ def static_views(samples, shift, times):
     features = jnp.concatenate([4 * second, jnp.stack(scalars, 1)], 1)
     spread = over_views(weights, jnp.stack([size, agree, through], 1))
     views = range(size.shape[0])
-    total = sum(weights[v] for v in views) / len(views)
-    best = sum(weights[v] / (1 + shift[v]) for v in views) / len(views)
+    total = added(weights[v] for v in views) / len(views)
+    best = added(weights[v] / (1 + shift[v]) for v in views) / len(views)
     summary = jnp.concatenate([spread, total[None], best[None]], 0).T
     return jax.lax.stop_gradient(StaticViews(features, weights, summary))
 
@@ -112,7 +112,8 @@ def static_field(params, point, direction, volume, samples, views, *, conditioni
 
     Args:
       params: `StaticParams`.
-      point: (P, n) encoded position. direction: (P, Q) encoded.
+      point: (P, n) encoded position.
+      direction: (P, Q) encoded.
       volume: (P, C) looked up in the geometry volume; C may be 0.
       samples: `ViewSamples` of the key-frames, or None without them.
       views: `StaticViews` for a blend head, or None: colours and visibility are then concatenated.
@@ -121,14 +122,14 @@ def static_field(params, point, direction, volume, samples, views, *, conditioni
     Returns:
       `StaticSample`.
 
-    Source: ZeST-NeRF eq. 3.
+    Source: ZeST-NeRF eq. 4.
     Differs from the reference: with a blend head the colour is a softmax over the key-frames' own colours.
     """
-    if views is not None:
-        lift = lifted(params.views, views.features)
-        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
-    else:
+    lift = None if views is None else lifted(params.views, views.features)
+    if views is None:
         condition = concatenated(volume, samples)
+    else:
+        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
     state = trunk(params.trunk, point, condition, conditioning=conditioning)
     if views is not None:
         scores = view_scores(params.views, lift, state)

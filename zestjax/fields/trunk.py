@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.checks import check_option
+from zestjax.fields.conditioning import added
 from zestjax.nets.layers import Dense, dense, init_dense
 
 
@@ -92,9 +93,9 @@ def lifted(params, features):
 def pooled_views(lift, weights):
     """(P, width) weighted mean over views of their activated features; weights (V, P), every view at least a little."""
     weights = weights + 1e-3
-    total = sum(weights[v] for v in range(len(lift)))
+    total = added(weights[v] for v in range(len(lift)))
     share = jax.lax.optimization_barrier(weights / total[None])
-    return sum(share[v][None] * jax.nn.relu(view) for v, view in enumerate(lift)).T
+    return added(share[v][None] * jax.nn.relu(view) for v, view in enumerate(lift)).T
 
 
 def view_scores(params, lift, hidden):
@@ -125,8 +126,8 @@ def blend_of_views(scores, prior, visible, colour):
     scores = 8 * jnp.tanh(scores / 8)  # bounded, so that no maximum over views is needed
     weights = jnp.exp(scores) * (prior + 1e-4) * visible
     views = range(weights.shape[0])
-    total = sum(weights[v] for v in views)
-    mean = sum(weights[v][None] * colour[v] for v in views)
+    total = added(weights[v] for v in views)
+    mean = added(weights[v][None] * colour[v] for v in views)
     return (mean / jnp.maximum(total, 1e-9)[None]).T
 
 

@@ -71,7 +71,7 @@ def latest_checkpoint(folder, like):
     warnings = []
     for step, path in _found(folder):
         try:
-            tree, metadata = load_weights(path, like)
+            tree, metadata = load_weights(path, like=like)
         except DamagedFileError as error:
             warnings.append(str(error))
             continue

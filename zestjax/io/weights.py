@@ -54,7 +54,7 @@ def save_weights(path, params, *, metadata):
         raise WeightsError(f"{path}: could not be written: {error.strerror or error}.") from error
 
 
-def load_weights(path, like=None):
+def load_weights(path, *, like=None):
     """Read what `save_weights` wrote.
 
     Args:

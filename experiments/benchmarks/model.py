@@ -1,0 +1,137 @@
+"""Seconds, memory and share of the machine's matmul peak of a training step and of a rendered view; a JSON line each.
+
+    python experiments/benchmarks/model.py [--preset small] [--repeats 5] [--rows 8]
+
+The clip is noise seen by cameras on a line: arithmetic does not depend on what is seen. `--rows` renders only that many
+rows of a view (0: all of it). Compile seconds are apart; peak memory is the process's.
+"""
+
+import argparse
+import json
+import os
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zestjax import batches, learn, model, novel_view
+from zestjax.apps.memory import peak_megabytes, reset_peak
+from zestjax.cameras import Camera
+from zestjax.losses.objective import PAPER_WEIGHTS
+from zestjax.presets import preset
+from zestjax.simulate.clips import Clip
+from zestjax.video import Video
+
+
+def noise_clip(config, frames=12, targets=2):
+    """A `Clip` of noise from cameras 0.1 apart, depths between 2 and 8."""
+    draw, size = np.random.default_rng(0), (config.height, config.width)
+    times = np.arange(targets, dtype=np.int32) + 4
+    image = lambda n: draw.integers(0, 256, (n, *size, 3), np.uint8)
+    depth = lambda n: draw.uniform(2, 8, (n, *size)).astype(np.float32)
+    mask = lambda n: draw.uniform(size=(n, *size)) > 0.9
+
+    def cameras(n):
+        intrinsics = np.array([[size[1], 0, size[1] / 2], [0, size[1], size[0] / 2], [0, 0, 1]], np.float32)
+        poses = np.tile(np.eye(4, dtype=np.float32), (n, 1, 1))
+        poses[:, 0, 3] = 0.1 * np.arange(n)
+        return np.tile(intrinsics, (n, 1, 1)), poses
+
+    (k, e), (tk, te) = cameras(frames), cameras(targets)
+    flow = np.zeros((targets, 2, *size, 3), np.float16)
+    return Clip(
+        image(frames), depth(frames), mask(frames), k, e, np.float32(2), np.float32(8), image(targets), depth(targets),
+        mask(targets), flow, image(targets), depth(targets), ~mask(targets), tk, te, times,
+    )  # fmt: skip
+
+
+def matmul_peak():
+    """Multiply-add operations per second of a large float32 product, best of five."""
+    n = 2048
+    product, x = jax.jit(jnp.dot), jnp.ones((n, n))
+    times = []
+    for _ in range(6):
+        start = time.perf_counter()
+        product(x, x).block_until_ready()
+        times.append(time.perf_counter() - start)
+    return 2 * n**3 / min(times[1:])
+
+
+def timed(run, compiled, repeats):
+    """Best and median seconds of a call, after two that do not count."""
+    times = []
+    for _ in range(repeats + 2):
+        start = time.perf_counter()
+        jax.block_until_ready(run())
+        times.append(time.perf_counter() - start)
+    counted = sorted(times[2:] or times[-1:])
+    cost = compiled.cost_analysis() or {}
+    return {"best": counted[0], "median": counted[len(counted) // 2], "flops": cost.get("flops")}
+
+
+def measure_step(config, clip, repeats):
+    """One training step: with the paper's losses for its encoder, with the shipped weights' otherwise."""
+    weights = PAPER_WEIGHTS if config.encoder == "pyramid" else learn.FRAME_WEIGHTS
+    init, step = learn.make_train_step(config, steps=1000, weights=weights)
+    prepared = batches.prepare_clip(jax.random.key(0), clip, config)
+    batch = batches.batch_from_clip(jax.random.key(1), prepared, config)
+    params = model.init_params(jax.random.key(2), config)
+    state = [params, init(params)]
+    start = time.perf_counter()
+    compiled = step.lower(*state, batch).compile()
+    seconds = time.perf_counter() - start
+
+    def run():
+        *state[:], info = compiled(*state, batch)
+        return info
+
+    return {"compile": seconds, **timed(run, compiled, repeats), "temp_mb": temporary(compiled)}
+
+
+def measure_view(config, clip, repeats, rows):
+    """One view, or its first rows."""
+    params = model.init_params(jax.random.key(2), config)
+    camera = Camera(clip.intrinsics, clip.camera_from_world)
+    video = Video(clip.images.astype(np.float32) / 255, camera, clip.near, clip.far)
+    prepared = novel_view.prepare(params, video, config=config)
+    inputs, frames = novel_view.target_inputs(
+        video.images, camera, clip.near, clip.far, Camera(*(x[3] for x in camera)), 5, config=config
+    )
+    maps = None if prepared.maps is None else jax.tree.map(lambda x: x[frames], prepared.maps)
+    start = time.perf_counter()
+    compiled = novel_view.render_inputs.lower(params, inputs, maps, config=config, rows=rows or None).compile()
+    seconds = time.perf_counter() - start
+    run = lambda: compiled(params, inputs, maps)
+    return {"compile": seconds, **timed(run, compiled, repeats), "temp_mb": temporary(compiled)}
+
+
+def temporary(compiled):
+    """MB of temporaries that the compiled program states."""
+    return compiled.memory_analysis().temp_size_in_bytes / 1e6
+
+
+def main():
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--preset", default="small")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--rows", type=int, default=0)
+    options = parser.parse_args()
+    config, peak = preset(options.preset), matmul_peak()
+    clip = noise_clip(config)
+    stages = {
+        "training step": lambda: measure_step(config, clip, options.repeats),
+        f"view, {options.rows or 'all'} rows": lambda: measure_view(config, clip, options.repeats, options.rows),
+    }
+    for name, stage in stages.items():
+        reset_peak()
+        row = {"preset": config.name, "what": name, **stage(), "peak_mb": peak_megabytes()}
+        if row["flops"]:
+            row["share_of_matmul_peak"] = row["flops"] / row["best"] / peak
+        row |= {"matmul_gflops": peak / 1e9, "load": os.getloadavg()[0], "device": jax.devices()[0].device_kind}
+        print(json.dumps({k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
