@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from zestjax.apps import paths, scoring, tables
+from zestjax.apps.host import host_camera, host_video
 from zestjax.cameras import Camera, project, rigid_inverse
-from zestjax.video import Video
 
 
 def image(seed, height=24, width=32):
@@ -88,7 +88,8 @@ def video():
     intrinsics = np.tile(np.array([[40, 0, 15.5], [0, 40, 11.5], [0, 0, 1]], np.float32), (frames, 1, 1))
     poses = np.tile(np.eye(4, dtype=np.float32), (frames, 1, 1))
     poses[:, 0, 3] = 0.2 * (np.arange(frames) % 4)
-    return Video(np.zeros((frames, 24, 32, 3), np.float32), Camera(intrinsics, poses), np.float32(2), np.float32(8))
+    images = np.zeros((frames, 24, 32, 3), np.float32)
+    return host_video(images, host_camera(intrinsics, poses), np.float32(2), np.float32(8))
 
 
 @pytest.mark.parametrize("name", sorted(paths.PATHS))

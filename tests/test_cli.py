@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import jax
 import numpy as np
@@ -9,8 +10,8 @@ import pytest
 
 from zestjax import novel_view
 from zestjax.apps import frontier
+from zestjax.apps.host import host_camera, host_video
 from zestjax.apps.weights import open_weights, system_of
-from zestjax.cameras import Camera
 from zestjax.cli import main
 from zestjax.io.nsff import write_nsff
 from zestjax.io.scenes import Target
@@ -18,7 +19,6 @@ from zestjax.io.weights import save_weights
 from zestjax.model import init_params
 from zestjax.novel_view import View
 from zestjax.presets import preset
-from zestjax.video import Video
 
 FRAMES, HEIGHT, WIDTH = 6, 32, 48
 
@@ -28,7 +28,7 @@ def camera(step):
     focal = np.array([[40, 0, (WIDTH - 1) / 2], [0, 40, (HEIGHT - 1) / 2], [0, 0, 1]], np.float32)
     pose = np.eye(4, dtype=np.float32)
     pose[0, 3] = 0.1 * step
-    return Camera(focal, pose)
+    return host_camera(focal, pose)
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +37,8 @@ def places(tmp_path_factory):
     root = tmp_path_factory.mktemp("cli")
     rng = np.random.default_rng(0)
     images = rng.random((FRAMES, HEIGHT, WIDTH, 3), np.float32)
-    cameras = Camera(*(np.stack(leaf) for leaf in zip(*(camera(i % 3) for i in range(FRAMES)), strict=True)))
-    video = Video(images, cameras, np.float32(1), np.float32(5))
+    cameras = host_camera(*(np.stack(leaf) for leaf in zip(*(camera(i % 3) for i in range(FRAMES)), strict=True)))
+    video = host_video(images, cameras, np.float32(1), np.float32(5))
     dynamic = np.zeros((HEIGHT, WIDTH), bool)
     dynamic[8:20, 8:30] = True
     depth = np.full((HEIGHT, WIDTH), 2, np.float32)
@@ -70,7 +70,8 @@ def grey(monkeypatch):
         size = prepared.images.shape[1:3]
         maps = np.full(size, 0.5, np.float32)
         colour = np.full((*size, 3), 0.5, np.float32)
-        return View(colour, colour, None, 4 * maps, maps, maps, np.zeros((*size, 2), np.float32))
+        leaves: Any = (colour, colour, None, 4 * maps, maps, maps, np.zeros((*size, 2), np.float32))
+        return View(*leaves)
 
     monkeypatch.setattr(novel_view, "prepare", lambda params, video, *, config: video)
     monkeypatch.setattr(novel_view, "render_view", render_view)

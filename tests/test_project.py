@@ -21,7 +21,7 @@ def test_optax_is_not_in_the_environment():
 def test_every_dependency_states_its_lower_bound():
     sys.path.insert(0, str(ROOT / "experiments"))
     try:
-        from lower_bounds import lower_bounds
+        lower_bounds = importlib.import_module("lower_bounds").lower_bounds
     finally:
         sys.path.pop(0)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -89,7 +89,8 @@ def read_clip(path):
 def write_clip(path, arrays):
     """Write arrays by name, atomically; those that are None are left out."""
     buffer = io.BytesIO()
-    np.savez(buffer, **{name: np.asarray(value) for name, value in arrays.items() if value is not None})
+    known: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
+    np.savez(buffer, **known)
     write_bytes(path, buffer.getvalue())
 
 
@@ -114,6 +115,7 @@ def make_clip(spec, folder, index):
 
         clip, key = clip_from_arrays(read_clip(path)), hole_key(spec.seed, index)
         prepared = prepare_clip(key, clip, preset("small", evidence_planes=spec.planes))
+        assert prepared.evidence is not None  # of the preset's encoder
         evidence = {f"{EVIDENCE}{name}": array for name, array in prepared.evidence._asdict().items()}
         write_clip(found, evidence | {"holes": np.array(prepared.holes, int)})
 
@@ -142,6 +144,8 @@ class Producer:
             stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self.log, text=True, env=environment,
             start_new_session=True,
         )  # fmt: skip
+        assert self.process.stdin is not None
+        self.asked = self.process.stdin
 
     def __enter__(self):
         return self
@@ -150,7 +154,7 @@ class Producer:
         self.process.kill()
         self.process.wait()
         with contextlib.suppress(OSError):
-            self.process.stdin.close()
+            self.asked.close()
         self.log.close()
         Path(self.log.name).unlink(missing_ok=True)
 
@@ -163,8 +167,8 @@ class Producer:
         missing = [str(index) for index in indices if not all(path.exists() for path in self.paths(index))]
         if missing:
             with contextlib.suppress(BrokenPipeError):  # `wait` reports what ended it
-                self.process.stdin.write(" ".join(missing) + "\n")
-                self.process.stdin.flush()
+                self.asked.write(" ".join(missing) + "\n")
+                self.asked.flush()
 
     def wait(self, index):
         """The arrays of clip `index`, once it is there.

@@ -146,6 +146,7 @@ def evaluate_target(view_of, scene, target, ceiling, out):
 def summary(rows):
     """The means over the targets: `mean`, `floors` and `ceiling` of metrics.json."""
     mean = mean_scores([{k: v for k, v in r["row"].items() if k not in ("time", "camera", "file")} for r in rows])
+    assert isinstance(mean, dict)
     mean["seconds_per_frame"] = mean.pop("seconds")
     return {
         "mean": mean,

@@ -72,7 +72,7 @@ def run_loop(step_fn, start, batch_at, options, *, metadata):
     recorder = Recorder(out / "log.jsonl", options.log_steps)
     save = lambda state, seconds: _save(out, state, metadata, seconds)
     with _StopOnSignal() as stop, _bar(start.step, options) as bar:
-        clock = _Clock(seconds, options)
+        state, clock = start, _Clock(seconds, options)
         for state, info in training_steps(step_fn, start, batch_at, steps=options.steps):
             clock.tick()
             recorder.add(state.step, info, clock)
@@ -111,7 +111,7 @@ def _restore(state, out, metadata):
             "command, or choose another --out."
         )
     cut_log(out / "log.jsonl", found.step)
-    return TrainState(*found.tree, found.step), found.metadata["seconds"]
+    return TrainState(found.tree[0], found.tree[1], found.step), found.metadata["seconds"]
 
 
 def _save(out, state, metadata, seconds):

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zestjax.apps.host import host_camera
 from zestjax.cameras import Camera, look_at, rigid_inverse
 
 CIRCLE = lambda s: np.stack([np.sin(2 * np.pi * s), np.cos(2 * np.pi * s), 0 * s], -1)
@@ -54,7 +55,7 @@ def camera_path(name, video, *, count=None):
         return _path_from_file(Path(name), frames)
     if name == "frames":
         index = np.round(np.linspace(0, frames - 1, count or frames)).astype(int)
-        return CameraPath(Camera(*(np.asarray(leaf)[index] for leaf in video.cameras)), index)
+        return CameraPath(host_camera(*(np.asarray(leaf)[index] for leaf in video.cameras)), index)
     count = 2 * frames if count is None else count
     s = np.arange(count) / count
     times = np.full(count, frames // 2) if name == "freeze" else np.floor(s * frames).astype(int)
@@ -85,7 +86,7 @@ def _moved(base, offsets, video):
     inwards = np.array([0, 0, _middle(video)])
     moved = position + np.einsum("tij,tj->ti", rotation, offsets * _radius(video))
     pose = look_at(*(x.astype(np.float32) for x in (moved, position + rotation @ inwards)), up=-rotation[:, :, 1])
-    return Camera(intrinsics.astype(np.float32), np.asarray(pose))
+    return host_camera(intrinsics.astype(np.float32), np.asarray(pose))
 
 
 def _middle(video):
@@ -105,7 +106,7 @@ def _path_from_file(path, frames):
         raise ValueError(f"{path}: is no path; give one of {', '.join(PATHS)}, or an .npz or .json file.")
     try:
         stored = json.loads(path.read_text()) if path.suffix == ".json" else dict(np.load(path))
-        camera = Camera(*(np.asarray(stored[name], np.float32) for name in Camera._fields))
+        camera = host_camera(*(np.asarray(stored[name], np.float32) for name in Camera._fields))
         times = np.asarray(stored["times"]).astype(int)
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(

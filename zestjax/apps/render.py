@@ -107,6 +107,7 @@ def camera_at(path, index):
 
 def _within(model, video, path, budget):
     """A `Renderer` at the largest scale whose frames fit the budget, and its size factors (u, v); else the smallest."""
+    view_of, factors = None, (1.0, 1.0)
     for scale in SCALES:
         smaller = scaled_video(video, scale)
         height, width = (new / old for new, old in zip(smaller.images.shape[1:3], video.images.shape[1:3], strict=True))
@@ -116,6 +117,7 @@ def _within(model, video, path, budget):
         _, seconds = view_of(resized(camera_at(path, 0), *factors), int(path.times[0]))
         if seconds * len(path.times) + view_of.prepare_seconds <= budget:
             break
+    assert view_of is not None
     return view_of, factors
 
 

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.cameras import Camera, project, unproject
+from zestjax.apps.host import host_camera
+from zestjax.cameras import project, unproject
 from zestjax.checks import check_option
 from zestjax.io.scenes import PROTOCOLS, Scene, Target, load_scene
 
@@ -22,7 +23,7 @@ class Opened(NamedTuple):
     ceiling: Callable | None
 
 
-def open_scene(name, config, *, size=None, protocol="held-out", targets=None, layout=None):
+def open_scene(name, config, *, size=None, protocol: str | None = "held-out", targets=None, layout=None):
     """Open a scene.
 
     Args:
@@ -77,7 +78,7 @@ def held_out_camera(simulated, time):
 
 def target_from_answers(shown, i, camera, protocol):
     """The i-th of `Answers` as a `Target`; its flow is towards the next time, as its own camera would see it."""
-    time, view = int(shown.times[i]), Camera(*(np.asarray(leaf)[i] for leaf in shown.cameras))
+    time, view = int(shown.times[i]), host_camera(*(np.asarray(leaf)[i] for leaf in shown.cameras))
     return Target(
         time=time,
         camera_name="input" if protocol != "held-out" else f"cam{camera:02d}",
@@ -94,7 +95,8 @@ def _flow_in_place(camera, depth, displacement):
     """(H, W, 2) pixels by which the points of a view move in a camera that stands still; NaN where they leave it."""
     pixels = np.stack(np.meshgrid(*(np.arange(side, dtype=np.float32) for side in depth.shape[::-1])), -1)
     known = np.isfinite(depth)
-    points = unproject(Camera(*map(jnp.asarray, camera)), jnp.asarray(pixels), jnp.asarray(np.where(known, depth, 1)))
-    landed = project(Camera(*map(jnp.asarray, camera)), points + jnp.asarray(displacement, jnp.float32))
+    camera = jax.tree.map(jnp.asarray, camera)
+    points = unproject(camera, jnp.asarray(pixels), jnp.asarray(np.where(known, depth, 1)))
+    landed = project(camera, points + jnp.asarray(displacement, jnp.float32))
     known &= np.asarray(landed.in_front)
     return np.where(known[..., None], np.asarray(landed.pixels) - pixels, np.nan).astype(np.float32)

@@ -40,7 +40,7 @@ def score_image(image, truth, dynamic=None):
     masks = {"full": everywhere}
     if dynamic is not None:
         masks |= {"dynamic": np.asarray(dynamic), "static": ~np.asarray(dynamic)}
-    scores = dict.fromkeys(REGIONS)
+    scores: dict = dict.fromkeys(REGIONS)
     for region, mask in masks.items():
         if mask.sum() >= LEAST_PIXELS:
             psnr, ssim = _measure(image, truth, jnp.asarray(mask, jnp.float32))

@@ -8,8 +8,10 @@ Source: Middlebury 2014 Motorcycle, at a quarter of its size, calibrated in `ski
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
+from zestjax.apps.host import host_camera, host_video
 from zestjax.cameras import Camera, resized
 from zestjax.io.pictures import resize_area, resize_nearest
 from zestjax.video import Video
@@ -42,16 +44,17 @@ def stereo_scene(height):
     have = disparity.shape
     size = (height, round(height * have[1] / have[0]))
     factors = (size[1] / have[1], size[0] / have[0])
-    cameras = resized(Camera(*(np.stack(leaf) for leaf in zip(camera(0.0), camera(1.0), strict=True))), *factors)
+    both = jax.tree.map(lambda *leaves: np.stack(leaves), camera(0.0), camera(1.0))
+    cameras = resized(both, factors[0], factors[1])
     known = np.isfinite(disparity)
     depth = np.where(known, FOCAL * BASELINE / (disparity + CENTRE_SHIFT), np.nan)
     near, far = 0.95 * depth[known].min(), 1.05 * depth[known].max()
     images = np.stack([resize_area(picture, *size) for picture in pictures])
-    middle, seen = carried_half_way(*pictures, disparity)
+    middle, seen = carried_half_way(pictures[0], pictures[1], disparity)
     return StereoScene(
-        Video(images, Camera(*map(np.asarray, cameras)), np.float32(near), np.float32(far)),
+        host_video(images, host_camera(*map(np.asarray, cameras)), np.float32(near), np.float32(far)),
         resize_nearest(depth, *size).astype(np.float32),
-        Camera(*map(np.asarray, resized(camera(0.5), *factors))),
+        host_camera(*map(np.asarray, resized(camera(0.5), factors[0], factors[1]))),
         resize_area(np.where(seen[..., None], middle, 0).astype(np.float32), *size),
         resize_area(seen.astype(np.float32)[..., None].repeat(3, -1), *size)[..., 0] > 0.999,
     )
@@ -63,7 +66,7 @@ def camera(share):
     intrinsics = np.array([[FOCAL, 0, centre[0]], [0, FOCAL, centre[1]], [0, 0, 1]], np.float32)
     pose = np.eye(4, dtype=np.float32)
     pose[0, 3] = -share * BASELINE
-    return Camera(intrinsics, pose)
+    return host_camera(intrinsics, pose)
 
 
 def carried_half_way(left, right, disparity):
