@@ -2,13 +2,28 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zestjax.apps import paths, scoring, tables
+from zestjax.apps import paths, scoring, stereo, tables
 from zestjax.apps.host import host_camera, host_video
-from zestjax.cameras import Camera, project, rigid_inverse
+from zestjax.cameras import Camera, project, rigid_inverse, unproject
+
+
+def test_the_stereo_pair_agrees_with_its_calibration():
+    scene = stereo.stereo_scene(72, 128)
+    rows, columns = (x.ravel()[::97] for x in np.nonzero(np.isfinite(scene.depth)))
+    left, right = (jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), scene.video.cameras) for i in (0, 1))
+    pixels = jnp.asarray(np.stack([columns, rows], -1), jnp.float32)
+    landed = project(right, unproject(left, pixels, jnp.asarray(scene.depth[rows, columns])))
+    np.testing.assert_allclose(landed.pixels[:, 1], rows, atol=1e-3)
+    u = np.round(np.asarray(landed.pixels[:, 0])).astype(int)
+    inside = (u >= 0) & (u < 128)
+    error = np.abs(scene.video.images[0][rows, columns] - scene.video.images[1][rows, np.clip(u, 0, 127)]).mean(-1)
+    assert np.median(error[inside]) < 0.04
+    assert 0.5 < scene.middle_known.mean() < 1 and float(scene.video.near) < float(scene.video.far)
 
 
 def image(seed, height=24, width=32):

@@ -13,7 +13,7 @@ from zestjax.apps.evaluate import EvaluateOptions, Renderer, floor_images, score
 from zestjax.apps.paths import camera_path
 from zestjax.apps.progress import progress
 from zestjax.apps.report import write_report
-from zestjax.apps.scenes import open_scene
+from zestjax.apps.scenes import BENCH_SIZE, open_scene
 from zestjax.apps.scoring import number, score_depth
 from zestjax.apps.stereo import stereo_scene
 from zestjax.apps.weights import open_weights
@@ -23,7 +23,6 @@ from zestjax.io.scenes import Target
 from zestjax.io.video import write_video
 
 SCENE, TIMES, FILM = "walker", (2, 8, 13, 19), 36
-STEREO_HEIGHT = 144
 
 
 def demo(out, *, quiet=False, weights=None):
@@ -69,7 +68,7 @@ def _bench(model, options, out, quiet):
 
 def _stereo(model, out):
     """The real stereo pair: its true depth, and the view half-way against both pictures carried there by it."""
-    stereo = stereo_scene(STEREO_HEIGHT)
+    stereo = stereo_scene(*BENCH_SIZE)  # the size of the other scene: nothing new is compiled
     video, view_of = stereo.video, Renderer(model, stereo.video)
     left = jax.tree.map(lambda leaf: leaf[0], video.cameras)
     at_left, _ = view_of(left, 1)

@@ -31,8 +31,8 @@ class StereoScene(NamedTuple):
     middle_known: np.ndarray
 
 
-def stereo_scene(height):
-    """The pair, `height` rows high.
+def stereo_scene(height, width):
+    """The pair, cut to the shape of `height` x `width` in the middle and resized to it.
 
     Returns:
       `StereoScene`.
@@ -40,11 +40,12 @@ def stereo_scene(height):
     from skimage.data import stereo_motorcycle
 
     left, right, disparity = stereo_motorcycle()
-    pictures = np.stack([left, right]).astype(np.float32) / 255
-    have = disparity.shape
-    size = (height, round(height * have[1] / have[0]))
-    factors = (size[1] / have[1], size[0] / have[0])
-    both = jax.tree.map(lambda *leaves: np.stack(leaves), camera(0.0), camera(1.0))
+    size, rows = (height, width), round(height * disparity.shape[1] / width)
+    top = (disparity.shape[0] - rows) // 2
+    disparity = disparity[top : top + rows]
+    pictures = np.stack([left, right])[:, top : top + rows].astype(np.float32) / 255
+    factors = (width / disparity.shape[1], height / rows)
+    both = jax.tree.map(lambda *leaves: np.stack(leaves), camera(0.0, top), camera(1.0, top))
     cameras = resized(both, factors[0], factors[1])
     known = np.isfinite(disparity)
     depth = np.where(known, FOCAL * BASELINE / (disparity + CENTRE_SHIFT), np.nan)
@@ -54,15 +55,15 @@ def stereo_scene(height):
     return StereoScene(
         host_video(images, host_camera(*map(np.asarray, cameras)), np.float32(near), np.float32(far)),
         resize_nearest(depth, *size).astype(np.float32),
-        host_camera(*map(np.asarray, resized(camera(0.5), factors[0], factors[1]))),
+        host_camera(*map(np.asarray, resized(camera(0.5, top), factors[0], factors[1]))),
         resize_area(np.where(seen[..., None], middle, 0).astype(np.float32), *size),
         resize_area(seen.astype(np.float32)[..., None].repeat(3, -1), *size)[..., 0] > 0.999,
     )
 
 
-def camera(share):
-    """The camera at a share of the way from the left (0) to the right (1) one, at full size."""
-    centre = (CENTRE[0] + share * CENTRE_SHIFT, CENTRE[1])
+def camera(share, top):
+    """The camera at a share of the way from the left (0) to the right (1) one, `top` rows cut off, at full size."""
+    centre = (CENTRE[0] + share * CENTRE_SHIFT, CENTRE[1] - top)
     intrinsics = np.array([[FOCAL, 0, centre[0]], [0, FOCAL, centre[1]], [0, 0, 1]], np.float32)
     pose = np.eye(4, dtype=np.float32)
     pose[0, 3] = -share * BASELINE
