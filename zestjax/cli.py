@@ -92,9 +92,6 @@ def _train(commands):
     command = _command(commands, "train", "scene-agnostic training", _run_train)
     command.add_argument("--preset", default="small", help="tiny, small or paper (default small)")
     command.add_argument("--system", default="zest", help="zest, zest-geometry, zest-motion or zest-none")
-    command.add_argument(
-        "--scenes", nargs="+", default=(), metavar="PATH", help="train on these, not on simulated ones"
-    )
     command.add_argument("--steps", type=_positive, default=20_000, help="in all, and length of the schedule")
     command.add_argument("--minutes", type=_positive_float, metavar="M", help="stop after so much stepping in all")
     command.add_argument("--resume", action="store_true", help="go on from the folder's newest checkpoint")

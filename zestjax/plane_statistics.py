@@ -37,7 +37,7 @@ class CostVolume(NamedTuple):
 
     mean: jax.Array
     variance: jax.Array
-    count: jax.Array
+    count: jax.Array  # pyright: ignore[reportIncompatibleMethodOverride]
     samples: jax.Array
 
 
@@ -46,7 +46,7 @@ class _Given(NamedTuple):
 
     mean: jax.Array | None
     variance: jax.Array | None
-    count: jax.Array | None
+    count: jax.Array | None  # pyright: ignore[reportIncompatibleMethodOverride]
 
 
 class Sweep(NamedTuple):

@@ -1,4 +1,4 @@
-"""`zestjax train`: one set of weights from many scenes, simulated as they are needed or read from folders."""
+"""`zestjax train`: one set of weights from many scenes, simulated as they are needed."""
 
 import dataclasses
 import time
@@ -27,7 +27,7 @@ AHEAD = 8  # clips that the producer keeps rendered beyond the newest one in use
 class TrainOptions:
     """The flags of `zestjax train`.
 
-    out, preset, steps, minutes, resume, seed, quiet: as the command's. scenes: folders to train on; empty: simulated.
+    out, preset, steps, minutes, resume, seed, quiet: as the command's.
     weights: start from these. clips: folder of rendered clips, kept; None: the cache, where used ones are removed.
     clip_count: reuse that many clips; None: new ones for ever. window: clips alive at a time.
     steps_per_clip: steps between one new clip and the next. checkpoint_minutes: between two checkpoints.
@@ -36,7 +36,6 @@ class TrainOptions:
 
     out: Path
     preset: str = "small"
-    scenes: tuple = ()
     steps: int = 20_000
     minutes: float | None = None
     resume: bool = False
@@ -93,7 +92,7 @@ def fresh(config, options):
 
 def run_metadata(config, options):
     """Everything that makes one run's numbers differ from another's, as JSON can hold it."""
-    data = {"scenes": [str(path) for path in options.scenes], "clip_count": options.clip_count}
+    data = {"scenes": "simulated", "clip_count": options.clip_count}
     data |= {"window": options.window, "steps_per_clip": options.steps_per_clip}
     config = {name: list(v) if isinstance(v, tuple) else v for name, v in dataclasses.asdict(config).items()}
     return {
@@ -119,7 +118,7 @@ def summarise(result, out, verb):
 
 
 def batches(config, options):
-    """Context: step -> batch, from simulated clips or, given `options.scenes`, from their frames."""
+    """Context: step -> batch, from simulated clips."""
     return _SimulatedBatches(config, options)
 
 

@@ -65,6 +65,11 @@ class Block(NamedTuple):
     norm: Norm
 
 
+def _normal(key, shape):
+    """Normal draws, flat and then shaped: a 4-D draw takes seconds to compile on a CPU, and gives the same numbers."""
+    return jax.random.normal(key, (math.prod(shape),)).reshape(shape)
+
+
 def init_dense(key, n_in, n_out, *, scale=1.0):
     """A `Dense` with normal kernel of variance 2 scale^2 / n_in (He) and bias 0."""
     return Dense(jax.random.normal(key, (n_in, n_out)) * (scale * (2 / n_in) ** 0.5), jnp.zeros(n_out))
@@ -72,13 +77,13 @@ def init_dense(key, n_in, n_out, *, scale=1.0):
 
 def init_conv2d(key, size, n_in, n_out, *, bias=True):
     """A 2-D `Conv` of odd `size` with normal kernel of variance 2 / (size^2 n_in); bias 0, or None."""
-    kernel = jax.random.normal(key, (size, size, n_in, n_out)) * (2 / (size**2 * n_in)) ** 0.5
+    kernel = _normal(key, (size, size, n_in, n_out)) * (2 / (size**2 * n_in)) ** 0.5
     return Conv(kernel, jnp.zeros(n_out) if bias else None)
 
 
 def init_conv3d(key, n_in, n_out):
     """A 3-D `Conv` of size 3 without bias; normal kernel of variance 2 / (27 n_in)."""
-    return Conv(jax.random.normal(key, (3, 3, 3, n_in, n_out)) * (2 / (27 * n_in)) ** 0.5, None)
+    return Conv(_normal(key, (3, 3, 3, n_in, n_out)) * (2 / (27 * n_in)) ** 0.5, None)
 
 
 def init_norm(channels):
