@@ -34,7 +34,7 @@ MINI = preset("tiny", height=16, width=24, evidence_planes=6, crop_rows=4, **SMA
 STILL = dataclasses.replace(MINI, dynamic=False)
 PAPER = dataclasses.replace(
     PRESETS["paper"], height=16, width=24, planes=4, features=8, volume_widths=(4, 8), key_frames=3, field_width=8,
-    field_depth=6, samples=4, point_levels=2, view_levels=1, crop_rows=4, ray_blocks=2,
+    field_depth=6, samples=4, point_levels=2, view_levels=1, crop_rows=4, mined_rays=8, ray_blocks=2,
 )  # fmt: skip
 
 

@@ -79,8 +79,8 @@ def test_every_ablation_traces_and_lacks_what_it_switches_off(base, geometry, mo
 def test_the_papers_preset_has_the_papers_shapes():
     config = PRESETS["paper"]
     params = shapes_of(config)
-    assert params.geometry.regulariser.blocks[0].conv.kernel.shape[-2] == 32 + 3 * 8
-    assert params.motion.regulariser.blocks[0].conv.kernel.shape[-2] == 32 + 3 * 4
+    assert params.geometry.regulariser.stem.conv.kernel.shape[-2] == 32 + 3 * 8
+    assert params.motion.regulariser.stem.conv.kernel.shape[-2] == 32 + 3 * 4
     assert [k.kernel.shape for k in params.static.trunk.layers] == [(63, 256), *[(256, 256)] * 4, (319, 256)] + [
         (256, 256)
     ] * 2
@@ -134,13 +134,11 @@ def program(config):
 def test_a_static_scene_has_neither_a_dynamic_field_nor_a_motion_volume_in_its_program():
     whole, still = program(MINI), program(STILL)
     without = program(dataclasses.replace(MINI, motion=False))
-    assert still["custom_vjp_call"] < without["custom_vjp_call"] < whole["custom_vjp_call"]
+    for name in ("conv_general_dilated", "scan", "gather"):  # the motion volume's
+        assert still[name] == without[name] < whole[name]
     assert still["dot_general"] < without["dot_general"] < whole["dot_general"]
-    assert still["gather"] < whole["gather"] and whole["tanh"] > still["tanh"]
-    sweeps = lambda count: count["while"] + count["scan"]
-    assert sweeps(whole) - sweeps(without) == sweeps(without) > 0  # each volume is one sweep
-    slots = stage.inputs_of(MINI)[0].slots
-    assert len(slots.images) == 3
+    assert "tanh" in without and "tanh" not in still  # of scene flow
+    assert whole["scan"] == 2 * still["scan"] > 0  # each volume is one sweep
 
 
 def test_slots_are_not_read_by_a_static_scene():

@@ -7,6 +7,7 @@ Vocabulary:
 Parameters are arrays only and float32 unless the caller casts them; what a layer is, is read off their shapes.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
