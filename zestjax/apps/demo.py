@@ -22,7 +22,7 @@ from zestjax.io.pictures import depth_picture, error_picture, share_picture, sid
 from zestjax.io.scenes import Target
 from zestjax.io.video import write_video
 
-SCENE, TIMES, FILM = "walker", (2, 8, 13, 19), 36
+SCENE, TIMES, FILM = "walker", (2, 8, 13, 19), 20
 
 
 def demo(out, *, quiet=False, weights=None):
