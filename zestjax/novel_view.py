@@ -129,7 +129,8 @@ def render_inputs(params, inputs, maps, *, config, rows=None):
     image = lambda x: x.reshape(blocks * together, width, *x.shape[2:])[:height]
     view = jax.tree.map(image, jax.lax.map(block, pixels))
     shown = lambda x: None if x is None else jnp.clip(x, 0, 1)
-    return view._replace(colour=shown(view.colour), static=shown(view.static), dynamic=shown(view.dynamic))
+    images = {name: shown(getattr(view, name)) for name in ("colour", "static", "dynamic", "opacity")}
+    return view._replace(**images)
 
 
 def _view_block(prediction, encoding, inputs, pixels, config):

@@ -145,7 +145,9 @@ def query_static(params, encoding, marched, *, config):
         samples = sample_views(encoding.key, points)
         if params.static.views is not None:
             shift = parallax(encoding.key.cameras, points, _flat(marched.beyond)[None])
-            views = static_views(samples, shift, encoding.key.times)
+            there = encoding.key.valid > 0  # an empty slot repeats a real frame, whose camera and time say nothing
+            shift, times = jnp.where(there[:, None], shift, 0), jnp.where(there, encoding.key.times, 0)
+            views = static_views(samples, shift, times)
     volume = look_up(encoding.geometry, _flat(marched.coords))
     return static_field(params.static, point, encoded_directions(marched, config), volume, samples, views)
 

@@ -6,7 +6,7 @@ Names and axes, the same in every function of this file:
     lengths   (..., S)     length of each sample's interval, world units, >= 0 and finite
     density   (..., S)     extinction, 1 / world unit, >= 0
     alpha     (..., S)     opacity of one interval, in [0, 1]
-    weights   (..., S)     share of the ray's colour owned by each sample, in [0, 1]; they sum to at most 1
+    weights   (..., S)     share of the ray's colour owned by each sample, in [0, 1]; one field's sum to at most 1
     blend     (..., S)     which field a sample belongs to, in [0, 1]: 0 all static, 1 all dynamic
     values    (..., S, C)  any per-sample quantity: colour, feature, scene flow
 
@@ -39,7 +39,11 @@ class Rendered(NamedTuple):
 
 
 class Blended(NamedTuple):
-    """Weights of the two fields that share one ray, each (..., S); together they sum to at most 1."""
+    """Weights of the two fields that share one ray, each (..., S) and each summing to at most 1.
+
+    Together they sum to at most 1 in the density form, but 4/3 in the opacity form: where both fields are opaque in one
+    sample, both own what reaches it.
+    """
 
     static: jax.Array
     dynamic: jax.Array

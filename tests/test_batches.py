@@ -1,0 +1,151 @@
+"""One target of a clip, with everything that is known about it."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+import pytest
+import stage
+from stage import MINI, PAPER
+
+from zestjax import batches
+from zestjax.assembly import video_evidence
+from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, prepare_clip
+from zestjax.evidence import Evidence
+from zestjax.learn import train_step
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Twenty batches of the stage."""
+    return [batch_from_clip(jax.random.key(i), stage.prepared(), MINI) for i in range(20)]
+
+
+def test_a_batch_is_a_function_of_its_key(drawn):
+    again = batch_from_clip(jax.random.key(0), stage.prepared(), MINI)
+    jax.tree.map(np.testing.assert_array_equal, again, drawn[0])
+    assert len({float(b.truth.pixels[0, 1]) for b in drawn}) > 3
+    assert {float(b.inputs.time) for b in drawn} == {2.0, 3.0, float(stage.prepared().holes[0])}
+
+
+def test_all_batches_have_one_structure(drawn):
+    shapes = lambda b: jax.tree.map(lambda x: (x.shape, str(x.dtype)), b)
+    assert all(shapes(b) == shapes(drawn[0]) for b in drawn)
+
+
+def test_the_crop_shows_whole_rows_of_the_target(drawn):
+    for found in drawn:
+        u, v = found.truth.pixels.reshape(4, 24, 2).transpose(2, 0, 1).astype(int)
+        np.testing.assert_array_equal(u, np.broadcast_to(np.arange(24), (4, 24)))
+        assert 0 <= v.min() and v.max() < 16 and (np.diff(v, axis=0) == 1).all()
+        time, x = int(found.inputs.time), -float(found.inputs.camera.camera_from_world[0, 3])
+        image, depth, moving, _ = stage.shot(x, time)
+        rows = slice(v[0, 0], v[0, 0] + 4)
+        np.testing.assert_allclose(found.truth.colour, image[rows].reshape(-1, 3), atol=0.5 / 255 + 1e-6)
+        np.testing.assert_allclose(found.truth.depth, depth[rows].reshape(-1), rtol=1e-6)
+        np.testing.assert_array_equal(found.truth.moving, moving[rows].reshape(-1))
+
+
+def test_uniform_rays_are_spread_over_the_image_and_mined_where_it_moves():
+    truth = stage.batch(PAPER).truth
+    count = PAPER.crop_rows * 24
+    assert len(truth.pixels) == count + PAPER.mined_rays
+    assert len(np.unique(truth.pixels[:count], axis=0)) == count and np.ptp(truth.pixels[:count, 1]) > 10
+    assert (truth.moving[count:] == 1).all()
+    image = stage.shot(0.1, 2)[0]
+    u, v = truth.pixels.astype(int).T
+    np.testing.assert_allclose(truth.colour, image[v, u], atol=0.5 / 255 + 1e-6)
+
+
+def test_a_hole_is_no_input_and_its_own_time_has_no_slot(drawn):
+    hole = stage.prepared().holes[0]
+    for found in drawn:
+        assert hole not in found.inputs.key.times
+        here = found.inputs.slots.times == hole
+        assert not np.asarray(found.inputs.slots.valid)[here].any()
+
+
+def test_nothing_is_known_of_a_holes_flow(drawn):
+    kinds = {bool(b.truth.known.any()): b for b in drawn}
+    frame, view = kinds[False], kinds[True]
+    assert not frame.truth.flow.any() and not frame.truth.flow_valid.any()
+    np.testing.assert_array_equal(frame.truth.static_valid, 1 - frame.truth.moving)
+    np.testing.assert_array_equal(view.truth.known, 1)
+    np.testing.assert_array_equal(view.truth.flow_valid, view.truth.moving)
+
+
+def test_the_cards_flow_is_its_motion():
+    truth = stage.batch().truth
+    moving = truth.moving > 0
+    np.testing.assert_allclose(
+        truth.flow[moving], np.broadcast_to([[0.1, 0, 0], [-0.1, 0, 0]], (moving.sum(), 2, 3)), atol=1e-3
+    )
+    assert not truth.flow[~moving].any()
+
+
+def planes_by_hand(depth, count, spacing):
+    if spacing == "depth":
+        return (depth - stage.NEAR) / (stage.FAR - stage.NEAR) * (count - 1)
+    return (1 / stage.NEAR - 1 / depth) / (1 / stage.NEAR - 1 / stage.FAR) * (count - 1)
+
+
+def test_depths_are_planes_of_the_volumes_and_of_the_frames():
+    found = stage.batch()
+    np.testing.assert_allclose(found.static_planes, planes_by_hand(stage.WALL, MINI.planes, "inverse"), rtol=1e-5)
+    wall, card = (planes_by_hand(z, MINI.evidence_planes, "inverse") for z in (stage.WALL, stage.CARD))
+    assert set(np.round(found.frame_planes, 3).ravel()) == set(np.round(np.float32([wall, card]), 3))
+    paper = stage.batch(PAPER)
+    np.testing.assert_allclose(paper.static_planes, planes_by_hand(stage.WALL, PAPER.planes, "depth"), rtol=1e-5)
+    assert paper.evidence is None
+
+
+def test_cells_and_half_pixels_cover_any_size():
+    ramp = np.broadcast_to(np.arange(9.0), (2, 13, 9))
+    assert batches._cells(ramp).shape == (2, 4, 3)
+    np.testing.assert_array_equal(batches._cells(ramp)[0, 0], [2, 6, 8])
+    mask = np.zeros((1, 5, 6), bool)
+    mask[0, :2, :1] = True
+    half = batches._half_mask(mask, (2, 2))
+    assert half.shape == (1, 4, 4) and half[0, 0, 0] == 0.5 and half.sum() == 0.5
+
+
+def test_hidden_frames_are_neither_inputs_nor_targets():
+    whole = stage.prepared()
+    hidden = PreparedClip(whole.clip, whole.evidence, whole.holes, (0, 1))
+    for seed in range(8):
+        inputs = batch_from_clip(jax.random.key(seed), hidden, MINI).inputs
+        assert not {0, 1} & set(inputs.key.times[inputs.key.valid > 0])
+        assert not np.asarray(inputs.slots.valid)[np.isin(inputs.slots.times, [0, 1])].any()
+
+
+def test_a_holes_pixels_influence_no_other_frames_evidence():
+    whole = stage.prepared()
+    images = whole.clip.images.copy()
+    images[whole.holes[0]] = 0
+    found = prepare_clip(jax.random.key(0), whole.clip._replace(images=images), MINI)
+    assert found.holes == whole.holes
+    others = np.delete(np.arange(stage.FRAMES), whole.holes[0])
+    for a, b in zip(found.evidence, whole.evidence, strict=True):
+        np.testing.assert_array_equal(a[others], b[others])
+        assert not np.array_equal(a[whole.holes[0]], b[whole.holes[0]])
+
+
+def test_a_frame_with_nothing_to_compare_with_says_nothing():
+    half, cameras = stage.video().images[:, ::2, ::2], stage.video().cameras
+    found = video_evidence(half, cameras, stage.NEAR, stage.FAR, planes=6, frames=[2], exclude=(0, 1, 3, 4, 5))
+    assert isinstance(found, Evidence) and (found.static == 255).all() and (found.moving == 255).all()
+
+
+def test_a_stored_clip_that_lacks_a_field_is_refused():
+    arrays = stage.clip()._asdict()
+    assert clip_from_arrays(arrays).far == stage.FAR
+    del arrays["depth"], arrays["near"]
+    with pytest.raises(ValueError, match="depth, near"):
+        clip_from_arrays(arrays)
+
+
+def test_a_crop_that_cannot_be_shared_among_the_blocks_is_refused():
+    step = train_step(dataclasses.replace(MINI, ray_blocks=5), solver=None)
+    with pytest.raises(ValueError, match="96 rays has no 5 equal blocks"):
+        jax.eval_shape(functools.partial(step, stage.params_of(MINI), None), stage.batch())
