@@ -113,7 +113,7 @@ def temporary(compiled):
 
 def main():
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Times a training step and a rendered view.")
     parser.add_argument("--preset", default="small")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--rows", type=int, default=0)
