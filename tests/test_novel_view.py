@@ -1,0 +1,132 @@
+"""Novel views of a prepared video: whole images, whatever their size, and frames that serve nothing."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import stage
+from stage import MINI, PAPER
+
+from zestjax import model, novel_view
+from zestjax.novel_view import prepare, render_inputs, render_view
+from zestjax.rays import pixel_grid
+
+CAMERA = stage.camera(0.1)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Parameters and a prepared video."""
+    params = stage.params_of(MINI)
+    return params, prepare(params, stage.video(), config=MINI)
+
+
+@pytest.fixture(scope="module")
+def view(scene):
+    return render_view(*scene, CAMERA, 2, config=MINI)
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def test_a_view_has_the_videos_size_and_its_ranges(view):
+    height, width = stage.SIZE
+    for image in (view.colour, view.static, view.dynamic):
+        assert image.shape == (height, width, 3) and (image >= 0).all() and (image <= 1).all()
+    assert view.flow.shape == (height, width, 2) and np.isfinite(view.flow).all()
+    assert (view.depth >= stage.NEAR - 1e-3).all() and (view.depth <= stage.FAR + 1e-3).all()
+    for share in (view.opacity, view.dynamicness):
+        assert share.shape == (height, width) and (share >= 0).all() and (share <= 1 + 1e-5).all()
+
+
+def test_rows_are_those_of_the_whole_image(scene, view):
+    params, prepared = scene
+    inputs, frames = stage.inputs_of(MINI)
+    maps = jax.tree.map(lambda x: x[frames], prepared.maps)
+
+    def whole(params, inputs, maps):
+        encoding = model.encode(params, inputs, maps, config=MINI)
+        return stage.render_rays(params, encoding, inputs, pixel_grid(*stage.SIZE).reshape(-1, 2), config=MINI)
+
+    out = jax.jit(whole)(params, inputs, maps)
+    np.testing.assert_allclose(np.clip(out.colour, 0, 1).reshape(view.colour.shape), view.colour, atol=2e-5)
+    np.testing.assert_allclose(out.depth.reshape(view.depth.shape), view.depth, rtol=1e-4)
+
+
+@pytest.mark.parametrize("rows", [3, 16])
+def test_the_block_size_does_not_matter(scene, view, rows, monkeypatch):
+    params, prepared = scene
+    inputs, frames = stage.inputs_of(MINI)
+    maps = jax.tree.map(lambda x: x[frames], prepared.maps)
+    monkeypatch.setattr(novel_view, "BLOCK_ROWS", rows)
+    render = jax.jit(functools.partial(render_inputs.__wrapped__, config=MINI))
+    for a, b in zip(render(params, inputs, maps), view, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+
+
+def test_an_excluded_frame_influences_nothing(scene):
+    params, _ = scene
+    video = stage.video()
+    images = video.images.copy()
+    images[2] = 1 - images[2]
+    changed = video._replace(images=images)
+    views = [
+        render_view(params, prepare(params, v, config=MINI), CAMERA, 2, config=MINI, exclude=(2,))
+        for v in (video, changed)
+    ]
+    assert same(*views)
+    free = [render_view(params, prepare(params, v, config=MINI), CAMERA, 2, config=MINI) for v in (video, changed)]
+    assert not same(*free) and not same(views[0], free[0])
+
+
+def test_excluding_nothing_is_no_exclusion(scene, view):
+    assert same(render_view(*scene, CAMERA, 2, config=MINI, exclude=()), view)
+
+
+def test_a_view_is_a_function_of_its_time(scene, view):
+    other = render_view(*scene, CAMERA, 3, config=MINI)
+    assert not np.array_equal(other.colour, view.colour)
+    late = render_view(*scene, CAMERA, stage.FRAMES + 3, config=MINI)  # no slot is filled
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(late))
+
+
+def test_a_camera_that_sees_nothing_of_the_video_renders_something_finite(scene):
+    behind = CAMERA._replace(camera_from_world=np.diag([-1.0, 1, -1, 1]).astype(np.float32))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(render_view(*scene, behind, 2, config=MINI)))
+
+
+@pytest.mark.parametrize("size", [(13, 18), (9, 5)])
+def test_images_of_any_size_are_rendered(scene, size):
+    video = stage.video(size)
+    out = render_view(scene[0], prepare(scene[0], video, config=MINI), stage.camera(0.1, size), 2, config=MINI)
+    assert out.colour.shape == (*size, 3) and all(np.isfinite(x).all() for x in jax.tree.leaves(out))
+
+
+def test_a_system_without_maps_of_frames_renders_too():
+    params = stage.params_of(PAPER)
+    prepared = prepare(params, stage.video(), config=PAPER)
+    assert prepared.half is None and prepared.maps is None
+    inputs, _ = stage.inputs_of(PAPER, exclude=(2,))
+    assert 2 not in inputs.key.times
+    out = jax.eval_shape(functools.partial(render_inputs, config=PAPER), params, inputs, None)
+    assert out.colour.shape == (*stage.SIZE, 3) and out.flow.shape == (*stage.SIZE, 2)
+
+
+def test_what_is_static_does_not_flow():
+    """The flow of an image is that of its dynamic share: without weight in the dynamic field it is 0."""
+    rays, samples = 4, 3
+    points = jnp.asarray(np.random.default_rng(0).uniform(0.4, 0.6, (rays, samples, 3)), jnp.float32)
+    encoding_frustum = model.reference_frustum(stage.inputs_of(MINI)[0], MINI)
+    world = novel_view.world_from_frustum(encoding_frustum, points, spacing="inverse")
+    marched = type("Marched", (), dict(coords=points, points=world))
+    dynamic = type("Dynamic", (), dict(flow_forward=jnp.full_like(points, 0.1)))
+    prediction = lambda share: type(
+        "Prediction", (), dict(marched=marched, dynamic=dynamic, dynamic_weights=share * weights, weights=weights)
+    )
+    weights = jnp.full((rays, samples), 1 / samples)
+    flow = lambda share: novel_view._optical_flow(prediction(share), encoding_frustum, CAMERA, None, MINI)
+    np.testing.assert_array_equal(flow(0.0), 0)
+    assert (flow(1.0)[:, 0] > 0.5).all()
