@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from oracles import assert_finite, assert_grads_match, normal
 
+from zestjax import analysis
 from zestjax.analysis import frame_maps, init_analysis, plane_moments
-from zestjax.evidence import Evidence
+from zestjax.evidence import FLOW_CHANNELS, Evidence
 
 moments = jax.jit(plane_moments)
 
@@ -68,7 +69,7 @@ def test_moments_match_finite_differences(x64):
 
 def evidence(seed=0, frames=3, planes=6):
     draw = lambda c: np.random.default_rng(seed).uniform(size=(frames, 4, 6, c)).astype(np.float32)
-    return Evidence(draw(planes), draw(planes), draw(12))
+    return Evidence(*(draw(n) for n in (planes, planes, planes, planes, FLOW_CHANNELS, 2, 12)))
 
 
 @pytest.fixture(scope="module")
@@ -95,11 +96,31 @@ def test_frames_do_not_see_each_other(analysed):
 
 
 def test_low_cost_at_a_plane_is_a_surface_there_before_anything_is_learned(analysed):
-    """The evidence is a prior: with a net that says nothing, the surface is the plane of least cost."""
+    """With a net that says nothing, the surface is the plane that the costs, and what is below, speak for."""
     params = jax.tree.map(jnp.zeros_like, analysed[0])
-    found = evidence()
+    found = evidence()._replace(
+        **{name: jnp.asarray(evidence()[0]).at[..., 2].set(0) for name in ("static", "best", "still")}
+    )
     maps = jax.jit(frame_maps)(params, found)
-    np.testing.assert_array_equal(maps.logits.argmax(-1), np.minimum(2 * found.static - 1, 1).argmin(-1))
+    np.testing.assert_array_equal(maps.logits.argmax(-1), 2)
+
+
+def test_the_surrounding_mean_leaves_out_what_is_outside():
+    x = normal(3, 2, 4, 7, 3)
+    found = analysis._surrounding_mean(x)
+    for i, j in np.ndindex(4, 7):
+        block = np.asarray(x)[:, max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3]
+        np.testing.assert_allclose(found[:, i, j], block.mean((1, 2)), atol=1e-5)
+
+
+def test_what_moves_stands_on_the_still_surface_below_it():
+    planes, still_at = 6, 4
+    costs = np.ones((analysis.COSTS, 1, 5, 3, planes), np.float32)
+    costs[:, :, 3:, :, still_at] = 0  # the ground, of the two lowest rows; above it nothing agrees anywhere
+    ground, still = analysis._ground(jnp.asarray(costs))
+    np.testing.assert_allclose(ground[0], still_at / (planes - 1), atol=1e-4)
+    np.testing.assert_allclose(still[:, :, 3:], 1)
+    assert (still[0, :, :3] < 1e-5).all()
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])

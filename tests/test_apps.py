@@ -1,15 +1,19 @@
-"""Scores as dicts, tables, and camera paths."""
+"""Scores as dicts, tables, camera paths, and where a run's batches come from."""
 
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import stage
 
-from zestjax.apps import paths, scoring, stereo, tables
+from zestjax.apps import paths, scoring, stereo, tables, train
 from zestjax.apps.host import host_camera, host_video
+from zestjax.apps.scenes import Opened
 from zestjax.cameras import Camera, project, rigid_inverse, unproject
+from zestjax.io.scenes import Scene
 
 
 def test_the_stereo_pair_agrees_with_its_calibration():
@@ -153,3 +157,29 @@ def test_a_bad_path_says_what_it_should_be(tmp_path, video):
     np.savez(tmp_path / "late.npz", **frames.cameras._asdict(), times=frames.times + 5)
     with pytest.raises(ValueError, match="0 to 11"):
         paths.camera_path(str(tmp_path / "late.npz"), video)
+
+
+def test_scenes_are_learned_from_in_turn_each_from_its_own_frames(monkeypatch):
+    dark = stage.video()._replace(images=0.5 * stage.video().images)
+    shown = {"light": stage.video(), "dark": dark}
+    opened = lambda name, config, *, protocol: Opened(Scene(name, shown[name], ()), None)
+    monkeypatch.setattr(train, "open_scene", opened)
+    options = train.TrainOptions(Path("unused"), scenes=("light", "dark"))
+    with train.batches(stage.MINI, options) as batch_at:
+        found = [batch_at(step) for step in range(4)]
+    brightest = [float(np.max(batch.inputs.key.images)) for batch in found]
+    assert max(brightest[1::2]) <= 0.5 < min(brightest[::2])
+    for batch in found:
+        assert int(batch.inputs.time) not in batch.inputs.key.times[batch.inputs.key.valid > 0]
+        assert not batch.truth.known.any()
+
+
+@pytest.mark.parametrize("change, words", [
+    ({"scenes": ("a",), "stage": "frames"}, "exact answers"),
+    ({"preset": "paper", "stage": "frames"}, "drop --stage"),
+    ({"stage": "rays"}, "`stage` is 'rays'"),
+])  # fmt: skip
+def test_stages_that_cannot_be_are_refused(change, words, tmp_path):
+    with pytest.raises(ValueError, match=words):
+        train.train(train.TrainOptions(tmp_path / "t", **change))
+    assert not (tmp_path / "t").exists()

@@ -10,8 +10,8 @@ import stage
 from stage import MINI, PAPER
 
 from zestjax import batches
-from zestjax.assembly import video_evidence
-from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, prepare_clip
+from zestjax.assembly import footage, video_evidence
+from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
 from zestjax.evidence import Evidence
 from zestjax.learn import train_step
 
@@ -126,15 +126,15 @@ def test_a_holes_pixels_influence_no_other_frames_evidence():
     found = prepare_clip(jax.random.key(0), whole.clip._replace(images=images), MINI)
     assert found.holes == whole.holes
     others = np.delete(np.arange(stage.FRAMES), whole.holes[0])
-    for a, b in zip(found.evidence, whole.evidence, strict=True):
+    for name, a, b in zip(Evidence._fields, found.evidence, whole.evidence, strict=True):
         np.testing.assert_array_equal(a[others], b[others])
-        assert not np.array_equal(a[whole.holes[0]], b[whole.holes[0]])
+        assert name not in ("static", "best", "colours") or not np.array_equal(a[whole.holes[0]], b[whole.holes[0]])
 
 
 def test_a_frame_with_nothing_to_compare_with_says_nothing():
-    half, cameras = stage.video().images[:, ::2, ::2], stage.video().cameras
-    found = video_evidence(half, cameras, stage.NEAR, stage.FAR, planes=6, frames=[2], exclude=(0, 1, 3, 4, 5))
-    assert isinstance(found, Evidence) and (found.static == 255).all() and (found.moving == 255).all()
+    seen, cameras = footage(stage.video().images), stage.video().cameras
+    found = video_evidence(seen, cameras, stage.NEAR, stage.FAR, planes=6, frames=[2], exclude=(0, 1, 3, 4, 5))
+    assert isinstance(found, Evidence) and all((cost == 255).all() for cost in found[:4]) and (found.sure == 0).all()
 
 
 def test_a_stored_clip_that_lacks_a_field_is_refused():
@@ -149,3 +149,17 @@ def test_a_crop_that_cannot_be_shared_among_the_blocks_is_refused():
     step = train_step(dataclasses.replace(MINI, ray_blocks=5), solver=None)
     with pytest.raises(ValueError, match="96 rays has no 5 equal blocks"):
         jax.eval_shape(functools.partial(step, stage.params_of(MINI), None), stage.batch())
+
+
+def test_a_batch_of_frames_holds_each_frame_with_its_own_truth():
+    whole = stage.prepared()
+    found = frame_batch(jax.random.key(3), [whole, whole], MINI)
+    assert len(found.frame_planes) == 2 * batches.FRAMES_PER_CLIP == len(found.evidence.static)
+    for i, evidence in enumerate(found.evidence.colours):
+        frame = next(k for k in range(stage.FRAMES) if np.array_equal(whole.evidence.colours[k], evidence))
+        depth = batches._cells(whole.clip.depth[frame])
+        np.testing.assert_allclose(found.frame_planes[i], planes_by_hand(depth, MINI.evidence_planes, "inverse"), 1e-4)
+        np.testing.assert_array_equal(found.frame_moving[i].sum(), whole.clip.moving[frame].mean() * 8 * 12)
+    assert (found.frame_valid == 1).all()
+    with pytest.raises(ValueError, match="encoder `pyramid` asks nothing of single frames"):
+        frame_batch(jax.random.key(0), [stage.prepared(PAPER)], PAPER)

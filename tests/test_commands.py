@@ -64,6 +64,19 @@ def test_a_killed_run_resumes_to_the_same_bits(place, weights):
         np.testing.assert_array_equal(whole[name], resumed[name], err_msg=name)
 
 
+def test_stages_follow_one_another_and_real_scenes_serve_too(place, weights, scene):
+    given = training(place, "frames")
+    finish(place, *given, "--stage", "frames", "--weights", weights)
+    finish(place, *training(place, "views"), "--stage", "views", "--weights", place / "frames/weights.safetensors")
+    own = ("train", "--preset", "tiny", "--scenes", scene, scene, "--steps", 3, "--out", place / "own")
+    finish(place, *own, "--weights", place / "views/weights.safetensors")
+    at = {name: load_weights(place / name / "weights.safetensors")[0] for name in ("whole", "frames", "views", "own")}
+    moved = lambda a, b: {name.split(".")[0] for name in at[a] if (at[a][name] != at[b][name]).any()}
+    assert moved("whole", "frames") == {"analysis"}
+    assert "analysis" not in moved("frames", "views") and {"geometry", "motion", "static"} <= moved("frames", "views")
+    assert moved("views", "own")
+
+
 def test_the_log_has_every_loss_term(place, weights):
     line = json.loads((weights.parent / "log.jsonl").read_text().splitlines()[-1])
     assert {"step", "seconds", "seconds_per_step", "total", "rec"} <= line.keys() and line["step"] == 12

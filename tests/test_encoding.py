@@ -24,6 +24,7 @@ def quarter(camera):
 
 REFERENCE = stage.camera(0.1)
 SOURCES = stage.cameras([0.0, 0.2, -0.3])
+TIMES = np.float32([-1, 0, 1])
 
 
 def votes_by_loop(samples, shares, depths):
@@ -57,7 +58,7 @@ def counted(samples):
     hom = homographies(quarter(REFERENCE), quarter(SOURCES), DEPTHS)
     wide = lambda x: jnp.asarray(x, samples.dtype)
     votes = encoding.cell_votes(samples, wide(hom), wide(sweep_grid(*SIZE)), wide(DEPTHS))
-    return encoding._geometry_votes(votes), encoding._motion_votes(votes)
+    return encoding._geometry_votes(votes), encoding._motion_votes(votes, wide(TIMES))
 
 
 def test_votes_match_finite_differences(x64):
@@ -94,8 +95,9 @@ def volume(kind):
         occupied=not paper, **options,
     )  # fmt: skip
     params = jax.jit(make)(jax.random.key(0))
+    views = lambda tables, valid: SweepViews(tables, quarter(SOURCES), valid, jnp.asarray(TIMES))
     run = lambda params, tables, valid: encode_volume(
-        params, SweepViews(tables, quarter(SOURCES), valid), quarter(REFERENCE), SIZE, DEPTHS, **options
+        params, views(tables, valid), quarter(REFERENCE), SIZE, DEPTHS, **options
     )
     total = lambda *args: jnp.sum(run(*args).cells ** 2)
     return params, jax.jit(lambda *args: (run(*args), jax.grad(total, argnums=(0, 1))(*args)))

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stage
-from oracles import assert_grads_match, uniform, value_and_gradients
+from oracles import assert_grads_match, normal, uniform, value_and_gradients
 
-from zestjax import evidence
-from zestjax.evidence import TRUNCATION, Sources
+from zestjax import evidence, optical_flow
+from zestjax.evidence import FLOW_RANGE, GAP, TRUNCATION, Neighbours, Sources
 from zestjax.planesweep import plane_depths
 
 pooled = jax.jit(evidence.pooled, static_argnums=1)
-static_cost, moving_cost = jax.jit(evidence.static_cost), jax.jit(evidence.moving_cost)
+static_costs, flow_gaps = jax.jit(evidence.static_costs), jax.jit(evidence.flow_gaps)
 
 
 def shifts(pairs):
@@ -49,89 +49,139 @@ def test_pooling_is_the_mean_of_blocks_with_the_edge_repeated(size):
 def test_half_images_hold_whole_cells(size):
     half = evidence.half_images(uniform(0, 2, *size, 3))
     assert half.shape == (2, 2 * -(-size[0] // 4), 2 * -(-size[1] // 4), 3)
-    assert evidence.cell_colours(half).shape == (2, half.shape[1] // 2, half.shape[2] // 2, 12)
+    assert evidence.cell_values(half).shape == (2, half.shape[1] // 2, half.shape[2] // 2, 12)
 
 
 def test_a_cell_holds_its_four_pixels_row_by_row():
     half = uniform(1, 4, 6, 3)
-    found = evidence.cell_colours(half)
+    found = evidence.cell_values(half)
     np.testing.assert_array_equal(found[1, 2].reshape(2, 2, 3), half[2:4, 4:6])
 
 
+def cells(x, factor=2):
+    """Mean over blocks of a (2h, 2w) map."""
+    return x.reshape(x.shape[0] // factor, factor, x.shape[1] // factor, factor).mean((1, 3))
+
+
 def static_by_loop(reference, images, pairs, valid):
+    """Means over all sources and over the better half, of cells of 2 x 2 pixels."""
     height, width, _ = reference.shape
-    out = np.ones((height, width))
-    for i in range(height):
-        for j in range(width):
-            costs = []
-            for image, (du, dv), ok in zip(images, pairs, valid, strict=True):
+    found = []
+    for image, (du, dv), ok in zip(images, pairs, valid, strict=True):
+        cost, seen = np.zeros((height, width)), np.zeros((height, width))
+        for i in range(height):
+            for j in range(width):
                 if ok and 0 <= i + dv < height and 0 <= j + du < width:
                     difference = np.abs(reference[i, j].astype(np.float64) - image[i + dv, j + du]).mean()
-                    costs.append(min(difference / TRUNCATION, 1))
-            out[i, j] = np.mean(costs) if costs else 1
-    return out
+                    cost[i, j], seen[i, j] = min(difference / TRUNCATION, 1), 1
+        found.append((cells(cost), cells(seen)))
+    everywhere = np.ones((height // 2, width // 2))
+    mean, best = everywhere.copy(), everywhere.copy()
+    for place in np.ndindex(mean.shape):
+        known = [(c[place], s[place]) for c, s in found if s[place] > 0]
+        if known:
+            mean[place] = sum(c for c, _ in known) / sum(s for _, s in known)
+            each = sorted(c / s for c, s in known)
+            best[place] = np.mean(each[: -(-len(each) // 2)])
+    return mean, best
 
 
 def sources(images, valid):
     return Sources(jnp.asarray(images), None, jnp.asarray(valid, jnp.float32))
 
 
-def test_the_static_cost_is_that_of_a_loop():
+@pytest.mark.parametrize("valid", [[1, 1, 0], [1, 1, 1], [0, 1, 0]])
+def test_static_costs_are_those_of_a_loop(valid):
     reference, images, pairs = uniform(0, 6, 8, 3), uniform(1, 3, 6, 8, 3), [(1, 0), (-2, 1), (0, 0)]
     images = 0.9 * reference[None] + 0.1 * images
-    found = static_cost(reference, sources(images, [1, 1, 0]), shifts(pairs))
-    expected = static_by_loop(np.asarray(reference), np.asarray(images), pairs, [1, 1, 0])
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    found = static_costs(reference, sources(images, valid), shifts(pairs))
+    expected = static_by_loop(np.asarray(reference), np.asarray(images), pairs, valid)
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
-def test_a_point_that_moves_evenly_costs_nothing_at_its_plane():
-    texture = np.asarray(uniform(2, 12, 16, 3))
-    roll = lambda k: np.roll(texture, k, axis=(0, 1))
-    here, before, after = roll(0), roll(-1), roll(1)
-    cost = moving_cost(here, before, after, shifts([(0, 0), (0, 0)]), jnp.ones(2))
-    np.testing.assert_allclose(cost[2:-2, 2:-2], 0, atol=1e-6)
-    still = static_cost(here, sources(np.stack([before, after]), [1, 1]), shifts([(0, 0), (0, 0)]))
-    assert still.mean() > 0.5
+def test_what_covers_a_point_in_half_the_sources_costs_nothing_in_the_better_half():
+    image, other = uniform(2, 6, 8, 3), 1 - uniform(2, 6, 8, 3)
+    mean, best = static_costs(image, sources(jnp.stack([image, other, other, image]), [1] * 4), shifts([(0, 0)] * 4))
+    np.testing.assert_allclose(best, 0, atol=1e-6)
+    assert mean.mean() > 0.3
 
 
-def test_one_neighbour_alone_decides_and_none_costs_one():
-    texture = uniform(3, 6, 8, 3)
-    noise = uniform(4, 6, 8, 3)
-    hom = shifts([(0, 0), (0, 0)])
-    np.testing.assert_allclose(moving_cost(texture, texture, noise, hom, jnp.asarray([1.0, 0])), 0, atol=1e-6)
-    np.testing.assert_array_equal(moving_cost(texture, texture, noise, hom, jnp.zeros(2)), 1)
-    np.testing.assert_array_equal(static_cost(texture, sources(texture[None], [0]), hom[:1]), 1)
+def test_exchanges_sort():
+    rows = uniform(3, 8, 5, 6)
+    np.testing.assert_array_equal(jnp.stack(evidence._ascending(list(rows))), np.sort(rows, axis=0))
+
+
+def gaps_by_loop(flow, sure, pairs):
+    """Where each cell goes if it stands still is a shift of whole quarter-resolution pixels."""
+    velocity = np.asarray(flow, np.float64) - 4 * np.asarray(pairs, np.float64)[:, None, None]
+    length = lambda v: np.minimum(np.linalg.norm(v, axis=-1) / GAP, 1)
+    total = sure.sum(0)
+    mean = (sure * length(velocity)).sum(0) / np.where(total > 0, total, 1)
+    even = 1 - sure[0] * sure[1] * (1 - length(velocity.sum(0)))
+    return np.where(total > 0, mean, 1), even
+
+
+def test_gaps_are_those_of_a_loop():
+    flow, sure = 6 * normal(0, 2, 4, 5, 2), np.round(np.asarray(uniform(1, 2, 4, 5)), 1)
+    sure[:, 0, 0] = 0
+    found = flow_gaps(flow, jnp.asarray(sure), shifts([(1, 0), (-1, 1)]))
+    for ours, theirs in zip(found, gaps_by_loop(flow, sure, [(1, 0), (-1, 1)]), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+def test_what_moves_evenly_has_no_gap_at_its_plane_however_fast_it_is():
+    here = jnp.asarray([[8.0, 4.0], [-4.0, 0.0]])[:, None, None] * jnp.ones((2, 3, 4, 1))  # of its plane
+    velocity = jnp.asarray([[13.0, -5.0], [-13.0, 5.0]])[:, None, None]
+    still, moving = flow_gaps(here + velocity, jnp.ones((2, 3, 4)), shifts([(2, 1), (-1, 0)]))
+    np.testing.assert_allclose(moving, 0, atol=1e-6)
+    np.testing.assert_array_equal(still, 1)
+    still, moving = flow_gaps(here + velocity, jnp.ones((2, 3, 4)), shifts([(3, 1), (-1, 0)]))
+    assert (moving > 0.9).all()
+
+
+def test_nothing_to_compare_with_costs_one():
+    image, hom = uniform(3, 6, 8, 3), shifts([(0, 0), (0, 0)])
+    for cost in (*static_costs(image, sources(image[None], [0]), hom[:1]), *flow_gaps(zero_flow(), 0 * sure(), hom)):
+        np.testing.assert_array_equal(cost, 1)
+
+
+def zero_flow():
+    return jnp.zeros((2, 3, 4, 2))
+
+
+def sure():
+    return jnp.ones((2, 3, 4))
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, 1e-12, 1e12])
 @pytest.mark.parametrize("level", [0.0, 1.0])
 def test_costs_stay_in_range_with_finite_gradients(scale, level):
     image, hom = jnp.full((6, 8, 3), level), shifts([(0, 0), (0, 0)]) * scale
-    values, gradients = value_and_gradients(both_costs, 3)(image, hom, jnp.ones(2))
+    values, gradients = value_and_gradients(all_costs, 4)(image, hom, 1e3 * level * (zero_flow() + 1), sure())
     for cost in values:
         assert (cost >= 0).all() and (cost <= 1).all()
     for leaf in gradients:
         assert np.isfinite(leaf).all()
 
 
-def both_costs(image, hom, valid):
-    return (
-        evidence.static_cost(image, Sources(jnp.stack([image, image]), None, valid), hom),
-        evidence.moving_cost(image, image, image, hom, valid),
-    )
+def all_costs(image, hom, flow, sure):
+    valid = jnp.ones(2, image.dtype)
+    static = evidence.static_costs(image, Sources(jnp.stack([image, image]), None, valid), hom)
+    return *static, *evidence.flow_gaps(flow, sure, hom)
 
 
 def test_costs_match_finite_differences(x64):
     draw = functools.partial(uniform, dtype=jnp.float64)
-    reference, images = draw(0, 5, 6, 3), draw(1, 2, 5, 6, 3)
+    reference, images = draw(0, 6, 6, 3), draw(1, 2, 6, 6, 3)
     images = 0.95 * reference[None] + 0.05 * images
     hom = jnp.asarray(shifts([(0.3, 0.4), (-0.6, 0.2)]), jnp.float64)
     valid = jnp.ones(2, jnp.float64)
-    cost = lambda r, i: (
-        evidence.static_cost(r, Sources(i, None, valid), hom),
-        evidence.moving_cost(r, i[0], i[1], hom, valid),
+    cost = lambda r, i, f, s: (
+        evidence.static_costs(r, Sources(i, None, valid), hom),
+        evidence.flow_gaps(f, s, hom),
     )
-    assert_grads_match(cost, reference, images, step=1e-7)
+    assert_grads_match(cost, reference, images, 2 * draw(2, 2, 3, 3, 2), draw(3, 2, 3, 3), step=1e-7)
 
 
 @pytest.fixture(scope="module")
@@ -139,33 +189,46 @@ def found():
     """Evidence of the stage's frame 2 from the others."""
     video = stage.video((32, 48))
     half = evidence.half_images(jnp.asarray(video.images))
-    pick = lambda frames, valid: Sources(
-        half[np.array(frames)], jax.tree.map(lambda x: x[np.array(frames)], video.cameras), jnp.asarray(valid)
-    )
+    flow = optical_flow.video_flow(video.images)
+    taken = lambda frames: jax.tree.map(lambda x: x[np.array(frames)], video.cameras)
     find = jax.jit(functools.partial(evidence.frame_evidence, planes=9))
     camera = jax.tree.map(lambda x: x[2], video.cameras)
-    ones = lambda n: np.ones(n, np.float32)
-    run = lambda far, near: find(
-        half[2], camera, pick([0, 1, 3, 4, 5], far * ones(5)), pick([1, 3], near * ones(2)), stage.NEAR, stage.FAR
-    )
+    far = [0, 1, 3, 4, 5]
+    run = lambda known, near: find(
+        half[2], camera, Sources(half[np.array(far)], taken(far), known * np.ones(5, np.float32)),
+        Neighbours(flow.flow[2], near * flow.sure[2], taken([3, 1])), stage.NEAR, stage.FAR,
+    )  # fmt: skip
     return run
 
 
-def test_the_wall_and_the_card_are_at_their_planes(found):
-    static, moving, colours = jax.tree.map(np.asarray, found(1, 1))
-    assert static.shape == moving.shape == (8, 12, 9) and colours.shape == (8, 12, 12)
+def test_the_wall_is_at_its_plane_by_colour_and_by_flow(found):
+    parts = jax.tree.map(np.asarray, found(1, 1))
+    assert all(cost.shape == (8, 12, 9) for cost in parts[:4])
+    assert [x.shape[-1] for x in parts[4:]] == [evidence.FLOW_CHANNELS, 2, 12]
     depths = np.asarray(plane_depths(stage.NEAR, stage.FAR, 9, spacing="inverse"))
     wall = int(np.argmin(np.abs(1 / depths - 1 / stage.WALL)))
     _, _, card, _ = stage.shot(stage.PLACES[2], 2, (32, 48))
     share = card.reshape(8, 4, 12, 4).mean((1, 3))
     alone = (share == 0)[2:-2, 2:-2]
-    best = static.argmin(-1)[2:-2, 2:-2][alone]
-    assert alone.sum() > 5 and np.median(np.abs(best - wall)) <= 1
+    assert alone.sum() > 5
+    for cost in (parts.static, parts.best, parts.still):
+        best = cost.argmin(-1)[2:-2, 2:-2][alone]
+        assert np.median(np.abs(best - wall)) <= 1
 
 
 def test_evidence_is_in_range_and_without_sources_it_says_nothing(found):
     for part in found(1, 1):
         assert (part >= 0).all() and (part <= 1).all()
-    static, moving, _ = found(0, 0)
-    np.testing.assert_array_equal(static, 1)
-    np.testing.assert_array_equal(moving, 1)
+    nothing = found(0, 0)
+    for cost in nothing[:4]:
+        np.testing.assert_array_equal(cost, 1)
+    np.testing.assert_array_equal(nothing.flow, 0.5)
+    np.testing.assert_array_equal(nothing.sure, 0)
+
+
+def test_flow_channels_are_what_the_flow_has_beyond_the_far_plane():
+    flow = jnp.asarray([[10.0, -6.0], [200.0, 0.0]])[:, None, None] * jnp.ones((2, 4, 6, 1))
+    found = evidence._flow_channels(Neighbours(flow, jnp.ones((2, 4, 6)), None), shifts([(1, -2), (0, 0)]))
+    each = found.reshape(2, 3, 4, 4)  # cells, their pixels, both neighbours' u and v
+    np.testing.assert_allclose(each[0, 0, 0], [0.5 + 8 / (2 * FLOW_RANGE), 0.5 - 2 / (2 * FLOW_RANGE), 1, 0.5])
+    assert (found == found[:1, :1]).all()

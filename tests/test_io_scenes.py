@@ -88,6 +88,28 @@ def test_a_written_scene_comes_back(written):
         np.testing.assert_array_equal(flow.vectors, vectors * flow.valid[..., None])
 
 
+def test_an_excluded_frame_is_never_read(written, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(written[0], folder)
+    (folder / "images/00002.png").write_bytes(b"no picture")
+    with pytest.raises(ValueError, match="00002.png"):
+        load_scene(folder)
+    scene, whole = load_scene(folder, exclude=(2,)), load_scene(written[0])
+    assert (scene.video.images[2] == 0).all()
+    np.testing.assert_array_equal(np.delete(scene.video.images, 2, 0), np.delete(whole.video.images, 2, 0))
+    with pytest.raises(ValueError, match="no frame 99 to exclude; the video has 0 to"):
+        load_scene(folder, exclude=(99,))
+
+
+def test_a_scene_is_found_inside_the_folder_given_if_it_is_the_only_one(written, tmp_path):
+    (tmp_path / "data").mkdir()
+    shutil.copytree(written[0], tmp_path / "data/scene")
+    np.testing.assert_array_equal(load_scene(tmp_path).video.images, load_scene(written[0]).video.images)
+    shutil.copytree(written[0], tmp_path / "data/again")
+    with pytest.raises(ValueError, match=r"several scenes \(data/again, data/scene\); name one"):
+        load_scene(tmp_path)
+
+
 def test_held_out_targets_are_the_other_cameras_with_their_truth(written):
     scene = load_scene(written[0])
     assert len(scene.targets) == N * (RIG - 1)

@@ -11,7 +11,7 @@ PACKAGE = Path(zestjax.__file__).parent
 LAYERS = [
     "numerics checks trees",
     "cameras video rays resample frustum",
-    "nets planesweep plane_statistics selection trust cost_volume evidence analysis encoding",
+    "nets planesweep plane_statistics selection trust cost_volume optical_flow evidence analysis encoding",
     "fields",
     "rendering depth flow presets model prediction assembly",
     "losses",

@@ -13,6 +13,7 @@ from stage import MINI, PAPER, STILL
 
 from zestjax import model, prediction
 from zestjax.cameras import Camera, project
+from zestjax.evidence import FLOW_CHANNELS, Evidence
 from zestjax.fields.static import StaticSample
 from zestjax.presets import PRESETS, preset
 from zestjax.rays import depths_from_fractions
@@ -25,15 +26,8 @@ def shapes_of(config):
 def evidence_of(config=MINI, seed=0):
     """Bytes of evidence of K key-frames and M slots."""
     draw = lambda *s: np.random.default_rng(seed).integers(0, 256, s).astype(np.uint8)
-    views, cells = config.key_frames + len(config.slots), (4, 6)
-    planes = config.evidence_planes
-    return model_evidence(draw(views, *cells, planes), draw(views, *cells, planes), draw(views, *cells, 12))
-
-
-def model_evidence(*parts):
-    from zestjax.evidence import Evidence
-
-    return Evidence(*parts)
+    views, planes = config.key_frames + len(config.slots), config.evidence_planes
+    return Evidence(*(draw(views, 4, 6, n) for n in (planes, planes, planes, planes, FLOW_CHANNELS, 2, 12)))
 
 
 def rendered(params, inputs, evidence, config=MINI):
@@ -130,7 +124,9 @@ def test_a_static_scene_has_neither_a_dynamic_field_nor_a_motion_volume_in_its_p
     for name in ("conv_general_dilated", "scan", "gather"):  # the motion volume's
         assert still[name] == without[name] < whole[name]
     assert still["dot_general"] < without["dot_general"] < whole["dot_general"]
-    assert whole["scan"] == 2 * still["scan"] > 0  # each volume is one sweep
+    assert (
+        whole["scan"] - 1 == 2 * (still["scan"] - 1) > 0
+    )  # each volume is one sweep; one looks for the frames' ground
 
 
 def test_slots_are_not_read_by_a_static_scene():
@@ -219,6 +215,14 @@ def test_renders_are_finite_and_bounded_whatever_the_frames(config, change):
     for share in (out.colour, out.static_colour, out.dynamicness):
         assert (share > -1e-4).all() and (share < 1 + 1e-3).all()
     assert (out.opacity >= 0).all() and (out.opacity < 4 / 3 + 1e-3).all()  # of two fields that share their samples
+
+
+@pytest.mark.parametrize("opacity", [0.0, 0.3, 1.0, 4 / 3])
+def test_a_filled_ray_shows_a_mean_of_colours(opacity):
+    colour, behind = opacity * jnp.asarray([[0.2, 0.5, 1.0]]), jnp.asarray([[1.0, 0.5, 0.2]])
+    share = min(opacity, 1)
+    found = prediction.filled(colour, jnp.full((1,), opacity), behind)
+    np.testing.assert_allclose(found, share * np.array([[0.2, 0.5, 1.0]]) + (1 - share) * behind, rtol=1e-5)
 
 
 def test_half_an_infinite_plane_is_held_at_a_finite_distance():

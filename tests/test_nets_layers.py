@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from oracles import assert_finite, assert_grads_match, normal
 
 from zestjax.nets.layers import Dense, Norm, dense, init_dense, init_norm, norm_act
 
@@ -79,7 +80,26 @@ def test_mean_far_from_zero_does_not_cost_the_variance():
 def test_instance_statistics_are_each_elements_own():
     x, params = sample(3, 4, 5, 2), Norm(jnp.array([1, 2], jnp.float32), jnp.array([0, 1], jnp.float32))
     alone = jnp.concatenate([norm_act(params, x[i : i + 1]) for i in range(3)])
-    np.testing.assert_allclose(norm_act(params, x, instance=True), alone, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(norm_act(params, x, over="element"), alone, rtol=1e-5, atol=1e-6)
+
+
+def test_channel_statistics_are_each_places_own():
+    x, params = sample(3, 4, 5, 6), Norm(jnp.arange(1.0, 7), jnp.linspace(-1, 1, 6))
+    wide = np.asarray(x, np.float64)
+    unit = (wide - wide.mean(-1, keepdims=True)) / np.sqrt(wide.var(-1, keepdims=True) + 1e-5)
+    expected = unit * np.arange(1.0, 7) + np.linspace(-1, 1, 6)
+    expected = np.where(expected > 0, expected, 0.01 * expected)
+    np.testing.assert_allclose(norm_act(params, x, over="channels"), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_channel_statistics_match_finite_differences(x64):
+    params = Norm(1 + normal(1, 5, dtype=jnp.float64) / 4, normal(2, 5, dtype=jnp.float64))
+    assert_grads_match(lambda p, x: norm_act(p, x, over="channels"), params, normal(0, 3, 5, dtype=jnp.float64))
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-20, 1e6])
+def test_channel_statistics_of_a_flat_place_are_finite(value):
+    assert_finite(lambda x: norm_act(init_norm(4), x, over="channels"), jnp.full((2, 4), value))
 
 
 def test_legacy_scale_is_the_absolute_value_plus_epsilon():

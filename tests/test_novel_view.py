@@ -108,7 +108,7 @@ def test_images_of_any_size_are_rendered(scene, size):
 def test_a_system_without_maps_of_frames_renders_too():
     params = stage.params_of(PAPER)
     prepared = prepare(params, stage.video(), config=PAPER)
-    assert prepared.half is None and prepared.maps is None
+    assert prepared.footage is None and prepared.maps is None
     inputs, _ = stage.inputs_of(PAPER, exclude=(2,))
     assert 2 not in inputs.key.times
     out = jax.eval_shape(functools.partial(render_inputs, config=PAPER), params, inputs, None)

@@ -44,6 +44,8 @@ def test_every_step_draws_from_its_window_and_the_draw_is_even():
 def test_the_draw_depends_on_seed_and_step_alone():
     draw = lambda seed: [training.clip_index(n, seed=seed, window=16, steps_per_clip=1) for n in range(20, 60)]
     assert draw(0) == draw(0) != draw(1)
+    another = [training.clip_index(n, seed=0, window=16, steps_per_clip=1, draw=1) for n in range(20, 60)]
+    assert another != draw(0)  # a step may see several
 
 
 def test_a_limited_number_of_clips_is_used_again():

@@ -6,18 +6,30 @@ E        planes, uniform in inverse depth, the nearest first
 coordinate  plane coordinate in [0, 1], linear in inverse depth: 0 at the near bound, 1 at the far one (a frustum's z)
 """
 
+import functools
+import math
+import operator
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from zestjax.evidence import FLOW_CHANNELS
 from zestjax.nets.unet2d import UNet2d, init_unet2d, unet2d
 
+STILL_COSTS, MOVING_COSTS = 6, 2  # static, best and still; moving; and each averaged over its surroundings
+COSTS = STILL_COSTS + MOVING_COSTS
+SURROUNDINGS = 5  # cells
+GAIN = 3.0  # nats between the least and the greatest of a cost, before anything is learned
+SUMMARIES = 2 * COSTS + 4
+STATIC_AROUND = 3  # of the costs, the static one averaged over its surroundings
+STANDING = (0.25, 0.5)  # static costs above which a cell is taken to be what moves, when looking for what it stands on
 MOVING_PARTS = 4  # a mask value for each half-resolution pixel of a cell
 
 
 class AnalysisParams(NamedTuple):
-    """net: 2-D U-Net over the cost channels of a frame (planes are channels)."""
+    """net: 2-D U-Net over the evidence of a frame (planes are channels)."""
 
     net: UNet2d
 
@@ -41,20 +53,68 @@ class FrameMaps(NamedTuple):
 
 def init_analysis(key, *, planes, features, widths):
     """Parameters for E planes and C features; `widths` are the U-Net's."""
-    n_in = 2 * planes + 12 + 5
-    return AnalysisParams(init_unet2d(key, n_in, widths, planes + MOVING_PARTS + features))
+    n_in = 4 * planes + SUMMARIES + FLOW_CHANNELS + 2 + 12
+    net = init_unet2d(key, n_in, widths, 2 * planes + COSTS + 2 + MOVING_PARTS + features)
+    return AnalysisParams(net._replace(head=jax.tree.map(lambda x: 0.1 * x, net.head)))
 
 
-def _channels(evidence):
-    static, moving, colours = (x.astype(jnp.float32) for x in evidence)
-    planes = jnp.linspace(0, 1, static.shape[-1], dtype=static.dtype)
-    best = lambda cost: planes[jnp.argmin(cost, axis=-1)]
-    extra = [static.min(-1), moving.min(-1), best(static), best(moving), static.mean(-1)]
-    return jnp.concatenate([2 * static - 1, 2 * moving - 1, 4 * colours - 2, jnp.stack(extra, -1)], -1)
+def _costs(evidence):
+    """(COSTS, V, h, w, E) all costs of a plane, each in [0, 1]: of standing still, then of moving evenly."""
+    still, moving = [evidence.static, evidence.best, evidence.still], [evidence.moving]
+    around = lambda costs: [_surrounding_mean(cost) for cost in costs]
+    return jnp.stack([*still, *around(still), *moving, *around(moving)])
+
+
+def _surrounding_mean(x):
+    """Mean of (V, h, w, E) over the square of cells around each, those outside left out."""
+    reach = SURROUNDINGS // 2
+    for axis in (1, 2):
+        count = jnp.ones((1,) * axis + (x.shape[axis],) + (1,) * (3 - axis), x.dtype)
+        x, count = (_windowed(a, axis, reach) for a in (x, count))
+        x = x / count
+    return x
+
+
+def _windowed(x, axis, reach):
+    pad = [(reach, reach) if a == axis else (0, 0) for a in range(x.ndim)]
+    padded = jnp.pad(x, pad)
+    take = lambda k: jax.lax.slice_in_dim(padded, k, k + x.shape[axis], axis=axis)
+    return functools.reduce(operator.add, (take(k) for k in range(2 * reach + 1)))
+
+
+def _ground(costs):
+    """(2, V, h, w) coordinate of the nearest still surface at or below a cell in its column, and (2, V, h, w) how much
+    of it is the cell's own; for both of `STANDING`. What moves mostly stands on what does not."""
+    summed = costs[:STILL_COSTS].sum(0)
+    own = (summed.argmin(-1) / (costs.shape[-1] - 1)).astype(costs.dtype)
+    least = costs[STATIC_AROUND].min(-1)
+    still = jnp.stack([jnp.exp(-jnp.square(least / level)) for level in STANDING])
+
+    def up(below, row):
+        here, weight = row
+        found = weight * here + (1 - weight) * below
+        return found, found
+
+    rows = jnp.moveaxis(jnp.broadcast_to(own, still.shape), 2, 0), jnp.moveaxis(still, 2, 0)
+    _, found = jax.lax.scan(up, rows[0][-1], rows, reverse=True)
+    return jnp.moveaxis(found, 0, 2), still
+
+
+def _channels(evidence, costs, ground, still):
+    """(V, h, w, n) what the net sees: every part of the evidence about 0, and where each cost is least."""
+    planes = jnp.linspace(-1, 1, costs.shape[-1], dtype=costs.dtype)
+    summaries = jnp.concatenate([2 * costs.min(-1) - 1, planes[costs.argmin(-1)], 2 * ground - 1, 2 * still - 1])
+    alone = (*costs[:STATIC_AROUND], costs[STILL_COSTS])
+    parts = [*(2 * cost - 1 for cost in alone), jnp.moveaxis(summaries, 0, -1)]
+    return jnp.concatenate([*parts, 8 * evidence.flow - 4, 2 * evidence.sure - 1, 2 * evidence.colours - 1], -1)
 
 
 def frame_maps(params, evidence):
     """Depth, moving pixels and features of each frame from its evidence.
+
+    A cell's surface stands still or moves, with the probability of its mask; either way it has a distribution over
+    planes, and the two are mixed. The net says how much each cost is to be believed there, how far from the ground
+    below it the moving surface is expected and how surely; what is left is free for every plane.
 
     Args:
       params: `AnalysisParams`.
@@ -65,16 +125,33 @@ def frame_maps(params, evidence):
 
     Source: zestjax: a coarse depth and a motion mask for every input frame.
     """
-    channels = _channels(evidence)
-    planes = evidence.static.shape[-1]
-    out = unet2d(params.net, channels)
-    # The evidence is a prior that the net corrects: low cost is high probability from the first step.
-    logits = out[..., :planes] - 4 * jnp.minimum(channels[..., :planes], 1)
-    moving, features = out[..., planes : planes + MOVING_PARTS], out[..., planes + MOVING_PARTS :]
-    coordinate, tolerance = plane_moments(logits)
+    evidence = jax.tree.map(lambda x: x.astype(jnp.float32), evidence)
+    costs = jax.lax.stop_gradient(_costs(evidence))
+    planes = costs.shape[-1]
+    ground, still = jax.lax.stop_gradient(_ground(costs))
+    out = unet2d(params.net, _channels(evidence, costs, ground, still))
+    parts = jnp.split(out, np.cumsum([planes, planes, COSTS, 1, 1, MOVING_PARTS]), axis=-1)
+    still_free, moving_free, gains, place, sharpness, moving, features = parts
+    gains = jax.nn.softplus(4 * gains + math.log(math.expm1(GAIN)))
+    believed = [gains[..., k : k + 1] * costs[k] for k in range(COSTS)]
+    index = jnp.linspace(0, 1, planes, dtype=out.dtype).reshape(1, 1, 1, planes)
+    away = jnp.abs(index - ground[0][..., None] - place)
+    standing = still_free - functools.reduce(operator.add, believed[:STILL_COSTS])
+    moved = moving_free - functools.reduce(operator.add, believed[STILL_COSTS:])
+    moved = moved - 10 * jax.nn.softplus(4 * sharpness) * away
+    moves = jnp.mean(moving, axis=-1, keepdims=True)
+    logits = _mixed(standing, moved, moves)
+    # The surface is that of the likelier kind: of the two, a sharp one would win the mixture's mode against a sure one.
+    coordinate, tolerance = plane_moments(jnp.where(moves > 0, moved, standing))
     v, h, w, _ = moving.shape
     moving = jnp.moveaxis(moving.reshape(v, h, w, 2, 2), 3, 2).reshape(v, 2 * h, 2 * w)
     return FrameMaps(features, logits, coordinate, tolerance, moving)
+
+
+def _mixed(standing, moved, moving):
+    """log((1 - p) softmax(standing) + p softmax(moved)) over the last axis, with p = sigmoid(moving)."""
+    log = lambda logits, logit: jax.nn.log_softmax(logits, axis=-1) + jax.nn.log_sigmoid(logit)
+    return jnp.logaddexp(log(standing, -moving), log(moved, moving))
 
 
 def plane_moments(logits, *, reach=2):

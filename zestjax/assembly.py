@@ -5,14 +5,16 @@ exclude  frames that must serve nothing: not as key-frame or slot, not in anothe
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from zestjax.cameras import Camera
-from zestjax.evidence import Evidence, Sources, frame_evidence, half_images
+from zestjax.evidence import Evidence, Neighbours, Sources, frame_evidence, half_images
 from zestjax.model import Frames, Inputs
+from zestjax.optical_flow import VideoFlow, video_flow
 from zestjax.selection import Chosen, key_frames, slots
 
 EVIDENCE_SOURCES = 8
@@ -29,24 +31,35 @@ def taken(cameras, frames):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[frames], cameras)
 
 
+class Footage(NamedTuple):
+    """What evidence is found from, once a video. half: (N, 2h, 2w, 3) float32, half resolution. flow: `VideoFlow`."""
+
+    half: jax.Array
+    flow: VideoFlow
+
+
+def footage(images):
+    """`Footage` of (N, H, W, 3) images, uint8 or float in [0, 1]."""
+    return Footage(_halved(jnp.asarray(images)), video_flow(images))
+
+
+@jax.jit
+def _halved(images):
+    images = images.astype(jnp.float32) / 255 if images.dtype == jnp.uint8 else images
+    return half_images(images)
+
+
 @functools.partial(jax.jit, static_argnames=("planes",))
 def _evidence(image, camera, sources, neighbours, near, far, *, planes):
     found = frame_evidence(image, camera, sources, neighbours, near, far, planes=planes)
     return Evidence(*(jnp.round(255 * jnp.clip(x, 0, 1)).astype(jnp.uint8) for x in found))
 
 
-@jax.jit
-def halved(images):
-    """(N, H, W, 3) uint8 or float images as float32 at half resolution."""
-    images = images.astype(jnp.float32) / 255 if images.dtype == jnp.uint8 else images
-    return half_images(images)
-
-
-def video_evidence(half, cameras, near, far, *, planes, frames=None, exclude=()):
+def video_evidence(footage, cameras, near, far, *, planes, frames=None, exclude=()):
     """`Evidence` of frames of a video, quantised to uint8 (1/255 of the truncation), on the host.
 
     Args:
-      half: (N, 2h, 2w, 3) from `halved`.
+      footage: `Footage` of N frames.
       cameras: `Camera` (N, ...) on the host, of full-size images.
       near: world units.
       far: world units.
@@ -57,17 +70,15 @@ def video_evidence(half, cameras, near, far, *, planes, frames=None, exclude=())
     Returns:
       `Evidence` of uint8 numpy arrays, leading axis `frames`.
     """
-    count = len(half)
+    half, (flow, sure) = footage
     places = positions(cameras)
     found = []
-    for i in range(count) if frames is None else frames:
+    for i in range(len(half)) if frames is None else frames:
         chosen, around = _compared(places, i, exclude)
-        pack = lambda c: Sources(half[c.frames], taken(cameras, c.frames), c.valid)
-        found.append(
-            _evidence(
-                half[i], taken(cameras, i), pack(chosen), pack(around), np.float32(near), np.float32(far), planes=planes
-            )
-        )
+        sources = Sources(half[chosen.frames], taken(cameras, chosen.frames), chosen.valid)
+        neighbours = Neighbours(flow[i], sure[i] * around.valid[:, None, None], taken(cameras, around.frames))
+        bounds = np.float32(near), np.float32(far)
+        found.append(_evidence(half[i], taken(cameras, i), sources, neighbours, *bounds, planes=planes))
     return jax.tree.map(lambda *rows: np.stack([np.asarray(r) for r in rows]), *found)
 
 
@@ -77,7 +88,7 @@ def _compared(places, frame, exclude):
     if others.issuperset(range(len(places))):
         return tuple(Chosen(np.full(n, frame), np.zeros(n, np.float32)) for n in (EVIDENCE_SOURCES, 2))
     chosen = key_frames(places, EVIDENCE_SOURCES, target=places[frame], time=frame, exclude=others)
-    return chosen, slots(len(places), frame, offsets=(-1, 1), exclude=others)
+    return chosen, slots(len(places), frame, offsets=(1, -1), exclude=others)
 
 
 def dequantised(evidence):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from zestjax.assembly import halved, target_inputs, video_evidence
+from zestjax.assembly import footage, target_inputs, video_evidence
 from zestjax.cameras import Camera
 from zestjax.evidence import Evidence
 from zestjax.measures import Truth
@@ -19,6 +19,7 @@ from zestjax.model import Inputs, cells_of
 from zestjax.simulate.clips import Clip
 
 HOLES = 3
+FRAMES_PER_CLIP = 4  # of a `FrameBatch`
 
 
 class Batch(NamedTuple):
@@ -36,6 +37,15 @@ class Batch(NamedTuple):
     frame_planes: jax.Array | np.ndarray
     frame_moving: jax.Array | np.ndarray
     frame_valid: jax.Array | np.ndarray
+
+
+class FrameBatch(NamedTuple):
+    """Frames of several clips and what they show, as in `Batch`: for training what each frame says of itself."""
+
+    evidence: Evidence
+    frame_planes: np.ndarray
+    frame_moving: np.ndarray
+    frame_valid: np.ndarray
 
 
 class PreparedClip(NamedTuple):
@@ -61,8 +71,9 @@ def prepare_clip(key, clip, config):
     if config.encoder != "frames":
         return PreparedClip(clip, None, holes)
     cameras = Camera(clip.intrinsics, clip.camera_from_world)
-    half = halved(clip.images)
-    evidence = video_evidence(half, cameras, clip.near, clip.far, planes=config.evidence_planes, exclude=holes)
+    evidence = video_evidence(
+        footage(clip.images), cameras, clip.near, clip.far, planes=config.evidence_planes, exclude=holes
+    )
     return PreparedClip(clip, evidence, holes)
 
 
@@ -146,6 +157,33 @@ def batch_from_clip(key, prepared, config):
         _cells(_planes(clip.depth[frames], clip, config.evidence_planes)), _half_mask(clip.moving[frames], cells),
         np.concatenate([inputs.key.valid, inputs.slots.valid]),
     )  # fmt: skip
+
+
+def frame_batch(key, clips, config):
+    """Frames of several clips: many scenes in one step make its gradient steady.
+
+    Args:
+      key: draws the frames.
+      clips: of `PreparedClip`, equally many frames of each.
+      config: `presets.Config`.
+
+    Returns:
+      `FrameBatch` of 4 frames of each clip, or of all if it has fewer.
+
+    Raises:
+      ValueError: the preset's frames have no evidence.
+    """
+    draw = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
+    parts = []
+    for clip, evidence, *_ in clips:
+        if evidence is None:
+            raise ValueError(f"frame_batch: encoder `{config.encoder}` asks nothing of single frames; use `frames`.")
+        chosen = draw.permutation(len(clip.images))[:FRAMES_PER_CLIP]
+        planes = _cells(_planes(clip.depth[chosen], clip, config.evidence_planes))
+        moving = _half_mask(clip.moving[chosen], planes.shape[1:])
+        parts.append(FrameBatch(jax.tree.map(lambda x, c=chosen: x[c], evidence), planes, moving,
+                                np.ones(len(chosen), np.float32)))  # fmt: skip
+    return jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
 
 
 def _shown(clip, kind, index):

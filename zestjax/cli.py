@@ -92,10 +92,18 @@ def _train(commands):
     command = _command(commands, "train", "scene-agnostic training", _run_train)
     command.add_argument("--preset", default="small", help="tiny, small or paper (default small)")
     command.add_argument("--system", default="zest", help="zest, zest-geometry, zest-motion or zest-none")
+    command.add_argument("--stage", default="all", help="frames (what each says of itself), views (the rest) or all")
+    command.add_argument(
+        "--scenes", nargs="+", default=(), metavar="PATH", help="learn from these (default: simulated)"
+    )
     command.add_argument("--steps", type=_positive, default=20_000, help="in all, and length of the schedule")
+    command.add_argument("--peak", type=_positive_float, default=2e-3, help="highest learning rate (default 0.002)")
     command.add_argument("--minutes", type=_positive_float, metavar="M", help="stop after so much stepping in all")
     command.add_argument("--resume", action="store_true", help="go on from the folder's newest checkpoint")
     command.add_argument("--weights", type=Path, metavar="W", help="start from these")
+    command.add_argument(
+        "--analysis", type=Path, metavar="W", help="take what analyses single frames from these instead"
+    )
     command.add_argument("--clips", type=Path, metavar="DIR", help="keep the rendered clips here")
     command.add_argument("--clip-count", type=_positive, metavar="N", help="reuse N clips (default: new ones for ever)")
     command.add_argument("--window", type=_positive, default=16, help="clips alive at a time (default 16)")

@@ -24,6 +24,7 @@ from zestjax.trust import Trust, agreement
 TRUST_MAPS = 3
 CELL_COLOURS = 12  # the four half-resolution pixels of a cell
 VOTE_GAIN = 4.0
+LEAST_HEARD = 0.02  # about a slot two frames away: less does not shout
 
 
 class VolumeParams(NamedTuple):
@@ -37,11 +38,12 @@ class VolumeParams(NamedTuple):
 
 class SweepViews(NamedTuple):
     """tables: (V, h, w, C + colours + maps), see the header. cameras: `Camera` (V, ...) at the tables' resolution.
-    valid: (V,) 1, or 0 for a slot the video does not fill."""
+    valid: (V,) 1, or 0 for a slot the video does not fill. times: (V,) frame time minus target time, frames."""
 
     tables: jax.Array
     cameras: Camera
     valid: jax.Array
+    times: jax.Array
 
 
 class Volume(NamedTuple):
@@ -118,12 +120,13 @@ def _geometry_votes(votes):
     return jnp.stack(shares, -1), VOTE_GAIN * (surface - through)
 
 
-def _motion_votes(votes):
-    """(D, h, w, 3 V) slot by slot, and (D, h, w) what they say of a moving surface here."""
+def _motion_votes(votes, times):
+    """(D, h, w, 3 V) slot by slot, and (D, h, w) what they say of a moving surface here: the sooner, the louder."""
     support = votes.moving * votes.surface
     channels = jnp.concatenate([support, votes.moving, votes.through], -1)
-    weight = jnp.maximum(jnp.sum(votes.seen, -1), 0.5)
-    return channels, VOTE_GAIN * jnp.sum(support - votes.through, -1) / weight
+    loudness = jnp.exp(-2 * jnp.abs(times))[:, None]
+    heard = lambda x: (x @ loudness)[..., 0]
+    return channels, VOTE_GAIN * heard(support - votes.through) / jnp.maximum(heard(votes.seen), LEAST_HEARD)
 
 
 def encode_volume(params, views, camera, size, depths, *, colours, trusted, slots):
@@ -166,7 +169,7 @@ def encode_volume(params, views, camera, size, depths, *, colours, trusted, slot
         channels, vote = [variance[..., : features + CELL_COLOURS], mean, count], 0
     if trusted:
         votes = cell_votes(cost.samples, hom, grid, depths)
-        extra, vote = (_motion_votes if slots else _geometry_votes)(votes)
+        extra, vote = _motion_votes(votes, views.times) if slots else _geometry_votes(votes)
         channels.append(extra)
     cells = cost_regulariser(params.regulariser, jnp.concatenate(channels, axis=-1))
     if params.occupied is None:

@@ -4,33 +4,47 @@ J        source frames compared with the reference frame
 E        planes of the sweep, uniform in inverse depth, the nearest first
 h w      rows and columns of a cell, a quarter of the image: cell j is centred on image pixel 4 j + 3/2
 cost     truncated absolute colour difference / TRUNCATION, in [0, 1]; 1 where nothing can be compared
+gap      image pixels between where the optical flow says a pixel goes and where it would go if it stood still on a
+         plane, / GAP and truncated, in [0, 1]; 1 where the flow is not to be trusted
+neighbours  the frames t + 1 and t - 1, in this order
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zestjax.cameras import Camera, resized
 from zestjax.checks import check_shapes
-from zestjax.numerics import matvec
+from zestjax.numerics import matvec, safe_norm
 from zestjax.planesweep import homographies, plane_depths
 from zestjax.resample import bilinear
 
 TRUNCATION = 0.15
-REACH = 2  # cells that a moving point may shift between frames, in the constant-velocity match
+GAP = 4.0
+FLOW_RANGE = 64.0  # pixels of flow, beyond what the far plane has, that the flow channels span either way
+FLOW_CHANNELS = 16  # at the four half-resolution pixels of a cell, to both neighbours
 
 
 class Evidence(NamedTuple):
     """Of one frame, or of many on a leading axis; every value in [0, 1].
 
     static: (h, w, E) mean cost over the sources if the point stands still at that plane.
-    moving: (h, w, E) cost if it moves with constant velocity through t - 1, t, t + 1: least over small opposite shifts.
+    best: (h, w, E) mean over the better half of them: what covers the point in some does not count.
+    still: (h, w, E) gap to the neighbours if the point stands still there.
+    moving: (h, w, E) gap if it moves with constant velocity through t - 1, t, t + 1 at that plane.
+    flow: (h, w, 16) optical flow minus that of the far plane; 1/2 is none, see `FLOW_RANGE`.
+    sure: (h, w, 2) trust in the flow to each neighbour.
     colours: (h, w, 12) the frame's colours at the four half-resolution pixels of the cell.
     """
 
     static: jax.Array
+    best: jax.Array
+    still: jax.Array
     moving: jax.Array
+    flow: jax.Array
+    sure: jax.Array
     colours: jax.Array
 
 
@@ -39,7 +53,16 @@ class Sources(NamedTuple):
 
     images: jax.Array
     cameras: Camera
-    valid: jax.Array
+    valid: jax.Array | np.ndarray
+
+
+class Neighbours(NamedTuple):
+    """How the frame's pixels move to its neighbours. flow: (2, 2h, 2w, 2) image pixels. sure: (2, 2h, 2w) in [0, 1],
+    0 where there is no such frame. cameras: `Camera` of full size (2, ...)."""
+
+    flow: jax.Array | np.ndarray
+    sure: jax.Array | np.ndarray
+    cameras: Camera
 
 
 def pooled(x, factor):
@@ -52,8 +75,8 @@ def pooled(x, factor):
     return x.mean(axis=(-4, -2))
 
 
-def cell_colours(half):
-    """Half-resolution images (..., 2h, 2w, 3) as the four colours of each cell, (..., h, w, 12)."""
+def cell_values(half):
+    """Half-resolution maps (..., 2h, 2w, C) as the four values of each cell, (..., h, w, 4 C)."""
     *lead, height, width, channels = half.shape
     x = half.reshape(*lead, height // 2, 2, width // 2, 2, channels)
     return jnp.moveaxis(x, -4, -3).reshape(*lead, height // 2, width // 2, 4 * channels)
@@ -66,54 +89,83 @@ def half_images(images):
     return jnp.pad(half, [*lead, (0, half.shape[-3] % 2), (0, half.shape[-2] % 2), (0, 0)], mode="edge")
 
 
-def _plane_cost(reference, warped, seen):
-    """(..., h, w) cost of one warped image; 1 where it does not see."""
-    difference = jnp.mean(jnp.abs(reference - warped), axis=-1)
-    return jnp.where(seen, jnp.minimum(difference / TRUNCATION, 1), 1)
-
-
 def _grid(height, width, dtype):
     v, u = jnp.meshgrid(jnp.arange(height, dtype=dtype), jnp.arange(width, dtype=dtype), indexing="ij")
     return jnp.stack([u, v, jnp.ones_like(u)], -1)
 
 
-def _warp(image, homography, grid):
+def _carried(homography, grid):
+    """Where a homography takes the grid's pixels (..., 2), and whether they stay in front."""
     points = matvec(homography, grid)
     front = points[..., 2] > 1e-6
-    sampled = bilinear(image, points[..., :2] / jnp.where(front, points[..., 2], 1)[..., None])
-    return sampled.values, sampled.visible & front
+    return points[..., :2] / jnp.where(front, points[..., 2], 1)[..., None], front
 
 
-def static_cost(reference, sources, hom):
-    """(2h, 2w) mean cost over the valid sources at one plane; hom (J, 3, 3) between half-resolution pixels."""
+def static_costs(reference, sources, hom):
+    """(h, w) mean cost over the valid sources at one plane, and over their better half; hom (J, 3, 3) between
+    half-resolution pixels of the reference (2h, 2w, 3) and the sources."""
     grid = _grid(reference.shape[0], reference.shape[1], reference.dtype)
 
-    def add(total, inputs):
+    def compare(_, inputs):
         image, homography, valid = inputs
-        warped, seen = _warp(image, homography, grid)
-        weight = seen.astype(valid.dtype) * valid
-        return (total[0] + weight * _plane_cost(reference, warped, seen), total[1] + weight), None
+        pixels, front = _carried(homography, grid)
+        warped, visible = bilinear(image, pixels)
+        weight = (visible & front).astype(valid.dtype) * valid
+        difference = jnp.mean(jnp.abs(reference - warped), axis=-1)
+        cost = weight * jnp.minimum(difference / TRUNCATION, 1)
+        return None, pooled(jnp.stack([cost, weight], -1), 2)
 
-    zero = jnp.zeros(reference.shape[:2], reference.dtype)
-    (total, count), _ = jax.lax.scan(add, (zero, zero), (sources.images, hom, sources.valid))
-    return jnp.where(count > 0, total / jnp.where(count > 0, count, 1), 1)
+    _, found = jax.lax.scan(compare, None, (sources.images, hom, sources.valid))
+    cost, weight = found[..., 0], found[..., 1]
+    mean = lambda cost, weight: jnp.where(weight > 0, cost / jnp.where(weight > 0, weight, 1), 1)
+    each = _ascending([jnp.where(w > 0, mean(c, w), 2) for c, w in zip(cost, weight, strict=True)])
+    count = jnp.sum(jnp.stack(each) <= 1, axis=0, dtype=cost.dtype)
+    kept = [(count > 2 * k).astype(cost.dtype) for k in range(len(each))]
+    better = mean(sum(k * e for k, e in zip(kept, each, strict=True)), sum(kept))
+    return mean(jnp.sum(cost, 0), jnp.sum(weight, 0)), better
 
 
-def moving_cost(reference, before, after, hom, valid):
-    """(h, w) least constant-velocity cost at one plane; quarter-resolution images, hom (2, 3, 3), valid (2,)."""
-    height, width, _ = reference.shape
-    grid = _grid(height, width, reference.dtype)
-    costs = []
-    for image, homography, sign in zip((before, after), hom, (1, -1), strict=True):
-        warped, seen = _warp(image, homography, grid)
-        both = jnp.concatenate([warped, seen[..., None].astype(warped.dtype)], -1)
-        both = jnp.pad(both, [(REACH, REACH), (REACH, REACH), (0, 0)])
-        shifts = [(sign * i, sign * j) for i in range(-REACH, REACH + 1) for j in range(-REACH, REACH + 1)]
-        moved = [both[REACH + i : REACH + i + height, REACH + j : REACH + j + width] for i, j in shifts]
-        costs.append(jnp.stack([_plane_cost(reference, m[..., :3], m[..., 3] > 0.5) for m in moved]))
-    weights = valid / jnp.maximum(jnp.sum(valid), 1)
-    total = jnp.min(weights[0] * costs[0] + weights[1] * costs[1], axis=0)
-    return jnp.where(jnp.sum(valid) > 0, total, 1)
+def _ascending(arrays):
+    """Arrays sorted element by element; a network of exchanges, many times faster than a sort over a leading axis."""
+    arrays = list(arrays)
+    for last in range(len(arrays) - 1, 0, -1):
+        for i in range(last):
+            arrays[i], arrays[i + 1] = jnp.minimum(arrays[i], arrays[i + 1]), jnp.maximum(arrays[i], arrays[i + 1])
+    return arrays
+
+
+def flow_gaps(flow, sure, hom):
+    """(h, w) gaps at one plane if a cell stands still there, and if it moves with constant velocity.
+
+    Args:
+      flow: (2, h, w, 2) image pixels.
+      sure: (2, h, w).
+      hom: (2, 3, 3) between quarter-resolution pixels.
+    """
+    grid = _grid(flow.shape[1], flow.shape[2], flow.dtype)
+    velocities, known = [], []
+    for k in range(2):
+        pixels, front = _carried(hom[k], grid)
+        velocities.append(flow[k] - 4 * (pixels - grid[..., :2]))
+        known.append(sure[k] * front.astype(sure.dtype))
+    length = lambda v: jnp.minimum(safe_norm(v) / GAP, 1)
+    total = known[0] + known[1]
+    gap = known[0] * length(velocities[0]) + known[1] * length(velocities[1])
+    still = jnp.where(total > 0, gap / jnp.where(total > 0, total, 1), 1)
+    return still, 1 - known[0] * known[1] * (1 - length(velocities[0] + velocities[1]))
+
+
+def _flow_channels(neighbours, hom):
+    """(h, w, 16) of the flow beyond that of the far plane; hom (2, 3, 3) between half-resolution pixels."""
+    _, height, width, _ = neighbours.flow.shape
+    grid = _grid(height, width, neighbours.flow.dtype)
+    parts = []
+    for flow, sure, homography in zip(neighbours.flow, neighbours.sure, hom, strict=True):
+        pixels, front = _carried(homography, grid)
+        known = front & (sure > 0)
+        own = jnp.where(known[..., None], flow - 2 * (pixels - grid[..., :2]), 0)
+        parts.append(jnp.clip(0.5 + own / (2 * FLOW_RANGE), 0, 1))
+    return cell_values(jnp.concatenate(parts, -1))
 
 
 def frame_evidence(image, camera, sources, neighbours, near, far, *, planes):
@@ -123,7 +175,7 @@ def frame_evidence(image, camera, sources, neighbours, near, far, *, planes):
       image: (2h, 2w, 3) the frame at half resolution (`half_images`).
       camera: its `Camera`, of the full-size image.
       sources: `Sources` for the static cost.
-      neighbours: `Sources` of two frames, t - 1 and t + 1.
+      neighbours: `Neighbours`.
       near: () world units.
       far: () world units.
       planes: E.
@@ -134,17 +186,17 @@ def frame_evidence(image, camera, sources, neighbours, near, far, *, planes):
     Source: zestjax; each input frame gets evidence of its own depth and motion.
     """
     check_shapes("frame_evidence", image=(image, "P Q 3"), sources=(sources.images, "J P Q 3"),
-                 neighbours=(neighbours.images, "2 P Q 3"))  # fmt: skip
+                 flow=(neighbours.flow, "2 P Q 2"), sure=(neighbours.sure, "2 P Q"))  # fmt: skip
     depths = plane_depths(near, far, planes, spacing="inverse")
-    half = lambda c: resized(c, 0.5, 0.5)
-    quarter = lambda c: resized(c, 0.25, 0.25)
-    hom_half = homographies(half(camera), half(sources.cameras), depths)
-    hom_quarter = homographies(quarter(camera), quarter(neighbours.cameras), depths)
-    small, around = pooled(image, 2), pooled(neighbours.images, 2)
+    scaled = lambda share, of: homographies(resized(camera, share, share), resized(of, share, share), depths)
+    weighted = pooled(neighbours.flow * neighbours.sure[..., None], 2)
+    sure = pooled(neighbours.sure[..., None], 2)
+    flow = weighted / jnp.where(sure > 0, sure, 1)
 
     def plane(hom):
-        static = pooled(static_cost(image, sources, hom[0])[..., None], 2)[..., 0]
-        return static, moving_cost(small, around[0], around[1], hom[1], neighbours.valid)
+        return *static_costs(image, sources, hom[0]), *flow_gaps(flow, sure[..., 0], hom[1])
 
-    static, moving = jax.lax.map(plane, (hom_half, hom_quarter))
-    return Evidence(jnp.moveaxis(static, 0, -1), jnp.moveaxis(moving, 0, -1), cell_colours(image))
+    found = jax.lax.map(plane, (scaled(0.5, sources.cameras), scaled(0.25, neighbours.cameras)))
+    static, best, still, moving = (jnp.moveaxis(x, 0, -1) for x in found)
+    beyond = _flow_channels(neighbours, scaled(0.5, neighbours.cameras)[-1])
+    return Evidence(static, best, still, moving, beyond, jnp.moveaxis(sure[..., 0], 0, -1), cell_values(image))

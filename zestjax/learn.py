@@ -12,8 +12,10 @@ import jax.numpy as jnp
 
 from zestjax.analysis import frame_maps
 from zestjax.assembly import dequantised
+from zestjax.checks import check_option
+from zestjax.evidence import pooled
 from zestjax.losses.means import mean_over_valid
-from zestjax.losses.objective import Terms, measured, weighted_sum
+from zestjax.losses.objective import Terms, absent, measured, weighted_sum
 from zestjax.losses.supervision import depth_cross_entropy_loss
 from zestjax.measures import make_measures
 from zestjax.model import Encoding, assemble, reference_frustum, volumes
@@ -22,10 +24,28 @@ from zestjax.schedules import cosine
 from zestjax.solve import Adam
 
 FRAME_WEIGHTS = Terms(
-    rec=20.0, static_rec=8.0, b=1e-3, depth_ce=0.1, mask=0.05, flow3d=0.2, frame_ce=0.1, frame_mask=0.1
+    rec=20.0, static_rec=8.0, dynamic_rec=4.0, b=1e-3, depth_ce=0.1, mask=0.05, flow3d=0.2, frame_ce=0.1, frame_mask=0.1
 )  # the shipped weights' terms, with the simulator's exact answers
-RAY_TERMS = ("rec", "static_rec", "mask", "b", "flow3d", "pho", "w", "cyc", "min", "sp", "temp", "geo", "depth")
-SCENE_TERMS = ("depth_ce", "frame_ce", "frame_mask")
+FRAME_TERMS = ("frame_ce", "frame_mask")
+STAGES = ("all", "frames", "views")
+RAY_TERMS = (
+    "rec",
+    "static_rec",
+    "dynamic_rec",
+    "mask",
+    "b",
+    "flow3d",
+    "pho",
+    "w",
+    "cyc",
+    "min",
+    "sp",
+    "temp",
+    "geo",
+    "depth",
+)
+SCENE_TERMS = ("depth_ce", *FRAME_TERMS)
+MOVER_SHARE = 4  # a cell that moves counts so many times one that does not, in the frames' depths
 
 
 def scene_terms(maps, encoded, batch, weights):
@@ -44,7 +64,8 @@ def scene_terms(maps, encoded, batch, weights):
         return total
 
     def frame_ce(_, batch):
-        valid = jnp.broadcast_to(batch.frame_valid[:, None, None], batch.frame_planes.shape)
+        moving = pooled(batch.frame_moving[..., None], 2)[..., 0]
+        valid = batch.frame_valid[:, None, None] * (1 + (MOVER_SHARE - 1) * moving) / MOVER_SHARE
         return depth_cross_entropy_loss(jax.nn.log_softmax(maps.logits, axis=-1), batch.frame_planes, valid=valid)
 
     def frame_mask(_, batch):
@@ -66,6 +87,23 @@ def _blocks(truth, count):
 
 def _only(weights, names):
     return Terms(**{name: getattr(weights, name) for name in names})
+
+
+def stage_weights(stage, *, weights=FRAME_WEIGHTS):
+    """The `Terms` of one stage of training: what each frame says of itself (`frames`), all else with that held as it
+    is (`views`), or both (`all`).
+
+    Raises:
+      ValueError: another stage.
+    """
+    check_option("stage_weights", stage=(stage, STAGES))
+    names = {"all": Terms._fields, "frames": FRAME_TERMS}.get(stage) or set(Terms._fields) - set(FRAME_TERMS)
+    return _only(weights, names)
+
+
+def frames_only(weights):
+    """Whether nothing is asked of any view, so that volumes and rays are not in the program."""
+    return all(absent(w) for name, w in weights._asdict().items() if name not in FRAME_TERMS)
 
 
 def make_train_step(config, *, steps, weights=FRAME_WEIGHTS, peak=2e-3, floor=2e-5, warmup=50):
@@ -100,8 +138,10 @@ def train_step(config, *, weights=FRAME_WEIGHTS, solver):
     Returns:
       `step(params, opt_state, batch) -> (params, opt_state, terms)`, pure; jit it with donated arguments. The objective
       is the mean over the blocks of rays of each block's own. It raises `ValueError` if the rays cannot be shared
-      evenly among `config.ray_blocks`.
+      evenly among `config.ray_blocks`. With `frames_only` weights there are no rays and a `FrameBatch` serves.
     """
+    if frames_only(weights):
+        return _frames_step(weights, solver)
     of_rays = _only(weights, RAY_TERMS if config.dynamic else ("rec",))
     rays = functools.partial(_rays, config=config, weights=of_rays)
 
@@ -127,11 +167,30 @@ def train_step(config, *, weights=FRAME_WEIGHTS, solver):
     return step
 
 
+def _frames_step(weights, solver):
+    """`train_step` of the frames' own terms alone."""
+
+    def step(params, opt_state, batch):
+        def loss(analysis):
+            maps = frame_maps(analysis, dequantised(batch.evidence))
+            terms = scene_terms(maps, (None, None), batch, weights)
+            return weighted_sum(terms, weights), terms
+
+        (total, terms), towards = jax.value_and_grad(loss, has_aux=True)(params.analysis)
+        grads = jax.tree.map(jnp.zeros_like, params)._replace(analysis=towards)
+        params, opt_state = solver.apply(params, opt_state, grads, total)
+        return params, opt_state, terms._asdict() | {"total": total}
+
+    return step
+
+
 def _scene(params, batch, *, config, weights):
     """((volumes, weighted loss of what needs no ray), (maps, its terms))."""
     maps = None
     if params.analysis is not None:
-        maps = frame_maps(params.analysis, dequantised(batch.evidence))
+        held = config.hold_trust and not config.features and all(absent(getattr(weights, n)) for n in FRAME_TERMS)
+        analysis = jax.lax.stop_gradient(params.analysis) if held else params.analysis
+        maps = frame_maps(analysis, dequantised(batch.evidence))
     encoded = volumes(params, batch.inputs, maps, config=config)
     guided = all(v is None or v.logits is not None for v in encoded)
     known = [n for n in SCENE_TERMS if (n == "depth_ce" and guided) or (n != "depth_ce" and maps is not None)]

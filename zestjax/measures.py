@@ -161,6 +161,7 @@ def make_measures(params, encoding, inputs, *, config, chain=False):
     return Terms(
         rec=lambda p, t: reconstruction_loss(p.colour, t.colour),
         static_rec=lambda p, t: reconstruction_loss(p.static_colour, t.static, valid=t.static_valid),
+        dynamic_rec=lambda p, t: reconstruction_loss(p.colour, t.colour, valid=t.moving),
         mask=lambda p, t: motion_mask_loss(p.dynamicness, t.moving),
         b=lambda p, t: blend_entropy_loss(p.blend),
         w=lambda p, t: disocclusion_loss(confidences(p), valid=exists),

@@ -15,7 +15,7 @@ import numpy as np
 from zestjax.analysis import AnalysisParams, init_analysis, plane_moments
 from zestjax.cameras import Camera, resized, scaled
 from zestjax.encoding import SweepViews, Volume, VolumeParams, encode_volume, init_volume
-from zestjax.evidence import cell_colours, half_images, pooled
+from zestjax.evidence import cell_values, half_images, pooled
 from zestjax.fields.conditioning import SourceViews
 from zestjax.fields.dynamic import DynamicParams, init_dynamic
 from zestjax.fields.static import StaticParams, init_static
@@ -129,20 +129,21 @@ def _inverse_depth(coordinate, near, far):
     return (1 - coordinate) / near + coordinate / far
 
 
-def _sweep_views(params, frames, maps, near, far, config):
+def _sweep_views(params, frames, maps, time, near, far, config):
     """Tables at volume resolution: from the frames' analysis, or from the volume's own feature net."""
     if config.encoder == "pyramid":
         features = feature_pyramid(params.pyramid, frames.images)
         colours = frames.images[:, ::4, ::4]
         tables = jnp.concatenate([features, colours], axis=-1)
-        return SweepViews(tables, scaled(frames.cameras, 0.25, 0.25), frames.valid)
-    parts = [maps.features, cell_colours(half_images(frames.images))]
+        return SweepViews(tables, scaled(frames.cameras, 0.25, 0.25), frames.valid, frames.times - time)
+    parts = [maps.features, cell_values(half_images(frames.images))]
     if config.trust:
         maps = jax.lax.stop_gradient(maps) if config.hold_trust else maps
         moving = pooled(jax.nn.sigmoid(maps.moving_logits)[..., None], 2)
         depth = _inverse_depth(maps.coordinate, near, far)
         parts += [moving, depth[..., None], (maps.tolerance * (1 / near - 1 / far))[..., None]]
-    return SweepViews(jnp.concatenate(parts, -1), resized(frames.cameras, 0.25, 0.25), frames.valid)
+    cameras = resized(frames.cameras, 0.25, 0.25)
+    return SweepViews(jnp.concatenate(parts, -1), cameras, frames.valid, frames.times - time)
 
 
 def _source_views(frames, maps, time, near, far, config):
@@ -194,7 +195,7 @@ def volumes(params, inputs, maps, *, config):
 
     def volume(part, frames, maps, slots):
         return encode_volume(
-            part, _sweep_views(part, frames, maps, near, far, config), frustum.camera,
+            part, _sweep_views(part, frames, maps, inputs.time, near, far, config), frustum.camera,
             (frustum.height, frustum.width), depths, slots=slots,
             colours="all" if config.conditioning == "concatenated" else "mean",
             trusted=config.encoder == "frames" and config.trust,

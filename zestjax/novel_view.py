@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax.analysis import FrameMaps, frame_maps
-from zestjax.assembly import dequantised, halved, target_inputs, video_evidence
+from zestjax.assembly import Footage, dequantised, footage, target_inputs, video_evidence
 from zestjax.cameras import project
 from zestjax.frustum import world_from_frustum
 from zestjax.model import encode
@@ -25,11 +25,11 @@ BLOCK_ROWS = 8  # rows rendered together: memory does not grow with the image
 
 
 class Prepared(NamedTuple):
-    """A scene's cache. video: `Video` on the host. half: (N, 2h, 2w, 3) half-resolution images, or None.
-    maps: `FrameMaps` of every frame, or None with an encoder that has none."""
+    """A scene's cache. video: `Video` on the host. footage: `assembly.Footage`, and maps: `FrameMaps` of every frame;
+    None with an encoder that has none."""
 
     video: Video
-    half: jax.Array | None
+    footage: Footage | None
     maps: FrameMaps | None
 
 
@@ -52,11 +52,11 @@ def _maps(params, evidence):
     return frame_maps(params, dequantised(evidence))
 
 
-def _frame_maps(params, half, video, config, *, frames=None, exclude=()):
+def _frame_maps(params, seen, video, config, *, frames=None, exclude=()):
     """`FrameMaps` of all frames or of those named, whose evidence is found once each."""
     used, place = (None, None) if frames is None else np.unique(frames, return_inverse=True)
     evidence = video_evidence(
-        half, video.cameras, video.near, video.far, planes=config.evidence_planes, frames=used, exclude=exclude
+        seen, video.cameras, video.near, video.far, planes=config.evidence_planes, frames=used, exclude=exclude
     )
     return _maps(params.analysis, evidence if place is None else jax.tree.map(lambda x: x[place], evidence))
 
@@ -75,8 +75,8 @@ def prepare(params, video, *, config):
     video = video._replace(images=np.asarray(video.images), cameras=jax.tree.map(np.asarray, video.cameras))
     if params.analysis is None:
         return Prepared(video, None, None)
-    half = halved(jnp.asarray(video.images))
-    return Prepared(video, half, _frame_maps(params, half, video, config))
+    seen = footage(video.images)
+    return Prepared(video, seen, _frame_maps(params, seen, video, config))
 
 
 def render_view(params, prepared, camera, time, *, config, exclude=()):
@@ -99,7 +99,7 @@ def render_view(params, prepared, camera, time, *, config, exclude=()):
     )
     maps = prepared.maps
     if maps is not None and len(exclude):
-        maps = _frame_maps(params, prepared.half, video, config, frames=frames, exclude=exclude)
+        maps = _frame_maps(params, prepared.footage, video, config, frames=frames, exclude=exclude)
     elif maps is not None:
         maps = jax.tree.map(lambda x: x[frames], maps)
     return render_inputs(params, inputs, maps, config=config)

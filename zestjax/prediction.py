@@ -199,6 +199,13 @@ def last_resort(field):
     return jnp.sum(share[..., None] * field.colour, axis=-2) / jnp.sum(share, axis=-1)[..., None]
 
 
+def filled(colour, opacity, behind):
+    """A ray's colour (R, 3) with what lies behind it (R, 3) where it lets light through; a mean of colours always, also
+    where the opacity (R,) of two fields that share their samples is above 1."""
+    opacity = opacity[:, None]
+    return colour / jnp.maximum(opacity, 1) + jnp.maximum(1 - opacity, 0) * behind
+
+
 def render_rays(params, encoding, inputs, pixels, *, config, jitter=None):
     """Render pixels of the target.
 
@@ -238,8 +245,8 @@ def render_rays(params, encoding, inputs, pixels, *, config, jitter=None):
     colour, static_colour = out.colour, out.static_colour
     if encoding.guides is not None:
         behind = last_resort(static)
-        colour = colour + (1 - out.opacity)[:, None] * behind
-        static_colour = static_colour + (1 - jnp.sum(out.static_weights, -1))[:, None] * behind
+        colour = filled(colour, out.opacity, behind)
+        static_colour = filled(static_colour, jnp.sum(out.static_weights, -1), behind)
     return Prediction(
         colour, static_colour, out.dynamic_colour, out.depth, out.dynamic_depth, out.opacity, out.dynamicness, blend,
         out.weights.static + out.weights.dynamic, out.weights.dynamic, out.dynamic_weights, moving, marched,

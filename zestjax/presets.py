@@ -36,7 +36,7 @@ class Config:
     spacing: str = "inverse"
     encoder: str = "frames"
     features: int = 0
-    frame_widths: tuple = (32, 48, 64)
+    frame_widths: tuple = (48, 64, 96, 128)
     volume_widths: tuple = (8, 16, 32)
     key_frames: int = 8
     key_frame_choice: str = "nearest"

@@ -38,11 +38,11 @@ def clip_window(step, *, window, steps_per_clip, count=None):
     return range(oldest, newest + 1) if count is None else range(max(oldest, newest - count + 1), newest + 1)
 
 
-def clip_index(step, *, seed, window, steps_per_clip, count=None):
-    """The clip that step `step` of run `seed` sees: drawn evenly from `clip_window` by (seed, step) alone."""
+def clip_index(step, *, seed, window, steps_per_clip, count=None, draw=0):
+    """A clip that step `step` of run `seed` sees: drawn evenly from `clip_window` by (seed, step, draw) alone."""
     live = clip_window(step, window=window, steps_per_clip=steps_per_clip, count=count)
-    draw = int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0])
-    index = live[draw % len(live)]
+    number = int(np.random.SeedSequence([seed, step, draw]).generate_state(1, np.uint64)[0])
+    index = live[number % len(live)]
     return index if count is None else index % count
 
 

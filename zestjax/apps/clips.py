@@ -54,7 +54,8 @@ def clip_folder(spec, *, root=None):
 
 def evidence_folder(folder, planes):
     """Where the evidence of a folder's clips lies: by planes and by the code that finds it."""
-    code = _code(*(f"{name}.py" for name in ("evidence", "assembly", "batches", "selection", "planesweep", "resample")))
+    parts = ("evidence", "optical_flow", "assembly", "selection", "planesweep", "resample")
+    code = _code(*(f"{name}.py" for name in parts))
     return Path(folder) / f"evidence-{planes}-{code}"
 
 

@@ -104,7 +104,9 @@ def _restore(state, out, metadata):
         return state, 0.0
     for warning in found.warnings:
         tqdm.write(f"warning: {warning} Going on from step {found.step}.", file=sys.stderr)
-    differing = [name for name in ("config", "seed", "data") if found.metadata["run"].get(name) != metadata.get(name)]
+    differing = [
+        name for name in ("config", "seed", "data", "stage") if found.metadata["run"].get(name) != metadata.get(name)
+    ]
     if differing:
         raise WeightsError(
             f"{out}: its checkpoints are of a run with another {' and '.join(differing)}; resume it with the same "

@@ -23,7 +23,7 @@ class Opened(NamedTuple):
     ceiling: Callable | None
 
 
-def open_scene(name, config, *, size=None, protocol: str | None = "held-out", targets=None, layout=None):
+def open_scene(name, config, *, size=None, protocol: str | None = "held-out", targets=None, layout=None, exclude=()):
     """Open a scene.
 
     Args:
@@ -33,6 +33,7 @@ def open_scene(name, config, *, size=None, protocol: str | None = "held-out", ta
       protocol: `held-out`, `strict` or `paper`; None where no target is wanted.
       targets: times to predict, or None for all. Of zest-bench all means every time, by one held-out camera each.
       layout: of the folder, recognised unless told.
+      exclude: frames that are never read; they are black.
 
     Returns:
       `Opened`.
@@ -43,21 +44,24 @@ def open_scene(name, config, *, size=None, protocol: str | None = "held-out", ta
     name = str(name)
     if name.startswith("bench:"):
         check_option("open_scene", protocol=(protocol, (*PROTOCOLS, None)))
-        return _open_bench(name.removeprefix("bench:"), size or BENCH_SIZE, protocol, targets)
+        return _open_bench(name.removeprefix("bench:"), size or BENCH_SIZE, protocol, targets, exclude)
     height, width = size or (config.height, None)
     scene = load_scene(
-        name, height=height, width=width, layout=layout, protocol=protocol or "strict", targets=targets
-    )  # fmt: skip
+        name, height=height, width=width, layout=layout, protocol=protocol or "strict", targets=targets, exclude=exclude
+    )
     return Opened(scene, None)
 
 
-def _open_bench(name, size, protocol, targets):
+def _open_bench(name, size, protocol, targets, exclude):
     from zestjax.simulate.bench import bench_scene
     from zestjax.simulate.ceiling import ceiling
     from zestjax.simulate.footage import answers, input_video
 
     simulated = bench_scene(name, height=size[0], width=size[1])
-    video = jax.tree.map(np.asarray, input_video(simulated))
+    if outside := [i for i in exclude if not 0 <= i < simulated.frames]:
+        raise ValueError(f"bench:{name}: no frame {outside[0]} to exclude; it has 0 to {simulated.frames - 1}.")
+    video = jax.tree.map(np.array, input_video(simulated))
+    video.images[list(exclude)] = 0
     if protocol is None:
         return Opened(Scene(name, video, (), layout="bench"), None)
     times = range(simulated.frames) if targets is None else targets

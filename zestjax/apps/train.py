@@ -1,5 +1,6 @@
-"""`zestjax train`: one set of weights from many scenes, simulated as they are needed."""
+"""`zestjax train`: one set of weights from many scenes, simulated as they are needed or read from folders."""
 
+import contextlib
 import dataclasses
 import time
 from pathlib import Path
@@ -10,17 +11,21 @@ import jax
 import zestjax
 from zestjax.apps.clips import EVIDENCE, ClipSource, ClipSpec, clip_folder, hole_key
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
+from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
+from zestjax.apps.scenes import open_scene
 from zestjax.apps.weights import SYSTEMS
-from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, prepare_clip
+from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
 from zestjax.checks import check_option
 from zestjax.evidence import Evidence
 from zestjax.io.weights import load_weights
-from zestjax.learn import make_train_step
+from zestjax.learn import FRAME_WEIGHTS, STAGES, make_train_step, stage_weights
 from zestjax.model import init_params
 from zestjax.presets import preset as preset_of
 from zestjax.training import TrainState, batch_key, clip_index, clip_window
 
+SCENES_PER_STEP = 4  # of the stage `frames`
 AHEAD = 8  # clips that the producer keeps rendered beyond the newest one in use
+KEPT = 128  # clips held in memory, about 20 MB each at 144x256
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,10 +33,12 @@ class TrainOptions:
     """The flags of `zestjax train`.
 
     out, preset, steps, minutes, resume, seed, quiet: as the command's.
-    weights: start from these. clips: folder of rendered clips, kept; None: the cache, where used ones are removed.
-    clip_count: reuse that many clips; None: new ones for ever. window: clips alive at a time.
-    steps_per_clip: steps between one new clip and the next. checkpoint_minutes: between two checkpoints.
-    system: one of `weights.SYSTEMS`.
+    weights: start from these. analysis: take the part that analyses single frames from these instead.
+    clips: folder of rendered clips, kept; None: the cache, where used ones are removed. clip_count: reuse that many
+    clips; None: new ones for ever. window: clips alive at a time. steps_per_clip: steps between one new clip and the
+    next. scenes: folders (or `bench:NAME`) whose own frames are predicted from one another; no simulated clips.
+    checkpoint_minutes: between two checkpoints. system: one of `weights.SYSTEMS`. stage: one of `learn.STAGES`.
+    peak: highest learning rate.
     """
 
     out: Path
@@ -41,13 +48,17 @@ class TrainOptions:
     resume: bool = False
     seed: int = 0
     weights: Path | None = None
+    analysis: Path | None = None
     clips: Path | None = None
     clip_count: int | None = None
+    scenes: tuple = ()
     window: int = 16
     steps_per_clip: int = 4
     checkpoint_minutes: float = 5.0
     quiet: bool = False
     system: str = "zest"
+    stage: str = "all"
+    peak: float = 2e-3
 
 
 class Summary(NamedTuple):
@@ -67,8 +78,12 @@ def train(options):
     Raises:
       ValueError, WeightsError: bad options; the folder holds another run; a damaged checkpoint.
     """
-    check_option("train", system=(options.system, tuple(SYSTEMS)))
+    check_option("train", system=(options.system, tuple(SYSTEMS)), stage=(options.stage, STAGES))
     config = preset_of(options.preset, **SYSTEMS[options.system])
+    if options.scenes and options.stage == "frames":
+        raise ValueError("train: --stage frames learns from exact answers, which --scenes lack; drop one of them.")
+    if options.stage != "all" and config.encoder != "frames":
+        raise ValueError(f"train: --stage {options.stage} needs a preset whose frames are analysed; drop --stage.")
     state, step_fn = fresh(config, options)
     metadata = run_metadata(config, options)
     limit = None if options.minutes is None else 60 * options.minutes
@@ -86,19 +101,25 @@ def fresh(config, options):
         params = init_params(jax.random.key(options.seed), config)
     if options.weights is not None:
         params, _ = load_weights(options.weights, like=params)
-    init, step_fn = make_train_step(config, steps=options.steps)
+    if options.analysis is not None:
+        params = params._replace(analysis=load_weights(options.analysis, like=params)[0].analysis)
+    weights = stage_weights(options.stage, weights=FRAMES_WEIGHTS if options.scenes else FRAME_WEIGHTS)
+    init, step_fn = make_train_step(
+        config, steps=options.steps, weights=weights, peak=options.peak, floor=options.peak / 100
+    )
     return TrainState(params, init(params), 0), step_fn
 
 
 def run_metadata(config, options):
     """Everything that makes one run's numbers differ from another's, as JSON can hold it."""
-    data = {"scenes": "simulated", "clip_count": options.clip_count}
+    data: dict = {"scenes": [str(s) for s in options.scenes] or "simulated", "clip_count": options.clip_count}
     data |= {"window": options.window, "steps_per_clip": options.steps_per_clip}
     config = {name: list(v) if isinstance(v, tuple) else v for name, v in dataclasses.asdict(config).items()}
     return {
         "preset": options.preset, "system": options.system, "config": config, "seed": options.seed,
-        "steps": options.steps, "data": data,
-        "start": None if options.weights is None else str(options.weights), "zestjax": zestjax.__version__,
+        "steps": options.steps, "stage": options.stage, "peak": options.peak, "data": data,
+        "start": None if options.weights is None else str(options.weights),
+        "analysis": None if options.analysis is None else str(options.analysis), "zestjax": zestjax.__version__,
         "jax": jax.__version__, "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
     }  # fmt: skip
 
@@ -118,8 +139,17 @@ def summarise(result, out, verb):
 
 
 def batches(config, options):
-    """Context: step -> batch, from simulated clips."""
+    """Context: step -> batch, from simulated clips or from the scenes named."""
+    if options.scenes:
+        return contextlib.nullcontext(_scene_batches(config, options))
     return _SimulatedBatches(config, options)
+
+
+def _scene_batches(config, options):
+    """step -> batch of one of the scenes in turn, each of which is read once and kept."""
+    opened = [open_scene(name, config, protocol=None) for name in options.scenes]
+    each = [frame_batches(o.scene.video, config, seed=options.seed) for o in opened]
+    return lambda step: each[step % len(each)](step // len(each))
 
 
 class _SimulatedBatches:
@@ -130,10 +160,11 @@ class _SimulatedBatches:
         spec = ClipSpec(options.seed, config.height, config.width, planes=planes)
         folder = clip_folder(spec, root=options.clips)
         self.config, self.seed, self.count = config, options.seed, options.clip_count
+        self.stage = options.stage
         self.window = {"window": options.window, "steps_per_clip": options.steps_per_clip, "count": self.count}
         self.ahead = AHEAD * options.steps_per_clip
         evict = options.clips is None and self.count is None
-        self.source = ClipSource(spec, folder, alive=options.window + 1, evict=evict)
+        self.source = ClipSource(spec, folder, alive=min(options.window, KEPT) + 1, evict=evict)
 
     def __enter__(self):
         return self.batch
@@ -142,13 +173,18 @@ class _SimulatedBatches:
         self.source.__exit__()
 
     def batch(self, step):
+        key = batch_key(step, seed=self.seed)
+        if self.stage == "frames":
+            return frame_batch(key, [self.prepared(step, draw) for draw in range(SCENES_PER_STEP)], self.config)
+        return batch_from_clip(key, self.prepared(step, 0), self.config)
+
+    def prepared(self, step, draw):
+        """`PreparedClip` of one of the clips that a step sees."""
         live, soon = clip_window(step, **self.window), clip_window(step + self.ahead, **self.window)
         wanted = range(live.start, soon.stop)
         wrapped = [index if self.count is None else index % self.count for index in wanted]
-        index = clip_index(step, seed=self.seed, **self.window)
-        arrays = self.source.clip(index, wrapped)
-        prepared = prepared_from_arrays(hole_key(self.seed, index), arrays, self.config)
-        return batch_from_clip(batch_key(step, seed=self.seed), prepared, self.config)
+        index = clip_index(step, seed=self.seed, draw=draw, **self.window)
+        return prepared_from_arrays(hole_key(self.seed, index), self.source.clip(index, wrapped), self.config)
 
 
 def prepared_from_arrays(key, arrays, config):

@@ -93,32 +93,40 @@ class Scene:
     layout: str = ""
 
 
-def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out", targets=None):
+def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out", targets=None, exclude=()):
     """Read a scene from a folder.
 
     Args:
-      path: a folder in one of the layouts of `LAYOUTS`.
+      path: a folder in one of the layouts of `LAYOUTS`, or one that holds a single such folder, up to two levels below.
       height: rows wanted; None follows from the width by the pictures' shape, or is theirs.
       width: columns wanted; the same.
       layout: its name; recognised unless told.
       protocol: `held-out`, `strict` or `paper`; see above.
       targets: which times to predict, as frame indices; `(time, camera name)` pairs choose single pictures; None for
         all.
+      exclude: frames whose pictures are not read; they are black.
 
     Returns:
       `Scene`.
 
     Raises:
-      ValueError: no such folder, unknown layout, a file that is not what it should be, a protocol that the scene has no
-        targets for, targets that do not exist, or a video that `check_inputs` refuses.
+      ValueError: no such folder, unknown layout, a frame to exclude that the video does not have, a file that is not
+        what it should be, a protocol that the scene has no targets for, targets that do not exist, or a video that
+        `check_inputs` refuses.
     """
     path = Path(path)
     check_option("load_scene", protocol=(protocol, PROTOCOLS))
-    record = LAYOUTS[_layout_of(path, layout)][1](path)
+    path, layout = _found(path, layout)
+    record = LAYOUTS[layout][1](path)
     if protocol == "held-out" and not record.held_out:
         raise ValueError(f"{path}: has no pictures of other cameras (mv_images), so no held-out target; use `strict`.")
-    size = _size(image_size(record.images[0]), height, width)
-    images = np.stack([resize_area(read_image(file), *size) for file in record.images])
+    if outside := [i for i in exclude if not 0 <= i < len(record.images)]:
+        raise ValueError(f"{path}: no frame {outside[0]} to exclude; the video has 0 to {len(record.images) - 1}.")
+    shown = [i for i in range(len(record.images)) if i not in set(exclude)]
+    size = _size(image_size(record.images[shown[0] if shown else 0]), height, width)
+    images = np.zeros((len(record.images), *size, 3), np.float32)
+    for i in shown:
+        images[i] = resize_area(read_image(record.images[i]), *size)
     cameras = _resized(record.cameras, record.size, size)
     video = Video._make((images, cameras, np.float32(record.near), np.float32(record.far)))
     check_inputs(str(path), video)
@@ -136,18 +144,24 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
     )
 
 
-def _layout_of(path, layout):
+def _found(path, layout):
+    """The folder of the scene, which may lie inside the one given, and its layout."""
     if not path.is_dir():
         raise ValueError(f"{path}: is not a folder; give one in a supported layout ({', '.join(LAYOUTS)}).")
     if layout is not None:
         check_option("load_scene", layout=(layout, tuple(LAYOUTS)))
-        return layout
-    found = [name for name, (recognises, _) in LAYOUTS.items() if recognises(path)]
-    if not found:
-        raise ValueError(
-            f"{path}: is in none of the supported layouts ({', '.join(LAYOUTS)}); see `zestjax.io` on each."
-        )
-    return found[0]
+    known = {layout: LAYOUTS[layout]} if layout is not None else LAYOUTS
+    for pattern in (".", "*", "*/*"):
+        folders = sorted(p for p in path.glob(pattern) if p.is_dir()) if pattern != "." else [path]
+        found = [(p, name) for p in folders for name, (recognises, _) in known.items() if recognises(p)]
+        if len({p for p, _ in found}) > 1:
+            names = ", ".join(sorted({str(p.relative_to(path)) for p, _ in found})[:5])
+            raise ValueError(f"{path}: holds several scenes ({names}); name one of them.")
+        if found:
+            return found[0]
+    if layout is not None:
+        return path, layout
+    raise ValueError(f"{path}: is in none of the supported layouts ({', '.join(LAYOUTS)}); see `zestjax.io` on each.")
 
 
 def _size(have, height, width):

@@ -65,7 +65,7 @@ def discriminator(params, patches, *, spectral=True):
     first, *middle, last = params.convs
     x = jax.nn.leaky_relu(conv2d(bounded(first), 2 * patches - 1, stride=2), SLOPE)
     for conv, norm in zip(middle, params.norms, strict=True):
-        x = norm_act(norm, conv2d(bounded(conv), x, stride=2), slope=SLOPE, instance=True)
+        x = norm_act(norm, conv2d(bounded(conv), x, stride=2), slope=SLOPE, over="element")
     return jnp.squeeze(conv2d(bounded(last), x), axis=-1)
 
 

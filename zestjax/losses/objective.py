@@ -18,7 +18,7 @@ class Terms(NamedTuple):
     flow prior), depth (depth prior).
     From a simulator's exact answers: depth_ce (cross-entropy over the volumes' planes), static_rec (render of the
     static field alone), frame_ce and frame_mask (each input frame's own depth and moving pixels), mask (dynamicness
-    against the motion mask), flow3d (scene flow).
+    against the motion mask), dynamic_rec (reconstruction of what moves alone), flow3d (scene flow).
     Other systems': distortion (weights lie together), edge (edge-aware disparity), adv (a discriminator's verdict).
     """
 
@@ -37,6 +37,7 @@ class Terms(NamedTuple):
     frame_ce: Any = None
     frame_mask: Any = None
     mask: Any = None
+    dynamic_rec: Any = None
     flow3d: Any = None
     distortion: Any = None
     edge: Any = None

@@ -140,26 +140,33 @@ def conv2d(params, x, *, stride=1):
     return out if params.bias is None else add_bias(out, params.bias)
 
 
-def norm_act(params, x, *, slope=0.01, instance=False, epsilon=1e-5, legacy_abs=False):
+def norm_act(params, x, *, slope=0.01, over="batch", epsilon=1e-5, legacy_abs=False):
     """Standardise each channel by its batch's statistics, scale and offset, leaky ReLU; x (..., C) -> (..., C).
 
-    Mean and biased variance (centred, two passes) are over every axis but the last: views of one scene are
-    normalised together.
+    Mean and biased variance are centred, in two passes.
 
     Args:
       params: a `Norm` of C channels.
       x: (..., C).
       slope: of the activation below 0.
-      instance: statistics of each element of the leading axis by itself.
+      over: what shares statistics. `batch`: every axis but the last, so that views of one scene are normalised
+        together; `element`: the same for each element of the leading axis by itself; `channels`: the channels of each
+        place, which keeps how strong a signal is against its surroundings.
       epsilon: added to the variance.
       legacy_abs: scale by |scale| + epsilon, as the fused norm that the published weights were trained with does.
 
     Raises:
-      ValueError: if x does not have C channels.
+      ValueError: if x does not have C channels, or on another `over`.
     """
     check_shapes("norm_act", scale=(params.scale, "C"), x=(x, "... C"))
+    check_option("norm_act", over=(over, ("batch", "element", "channels")))
     scale = jnp.abs(params.scale) + epsilon if legacy_abs else params.scale
-    groups = x.shape[0] if instance else 1
+    if over == "channels":
+        centred = x - jnp.mean(x, axis=-1, keepdims=True)
+        unit = centred * lax.rsqrt(jnp.mean(jnp.square(centred), axis=-1, keepdims=True) + epsilon)
+        out = add_bias(unit * add_bias(jnp.zeros_like(x), scale), params.offset)
+        return jnp.where(out > 0, out, slope * out)
+    groups = x.shape[0] if over == "element" else 1
     flat = x.reshape(groups, -1, x.shape[-1])
     return _norm_act(slope, epsilon, scale, params.offset, flat).reshape(x.shape)
 
@@ -194,6 +201,6 @@ _norm_act = jax.custom_vjp(_standardise, nondiff_argnums=(0, 1))
 _norm_act.defvjp(_norm_act_fwd, _norm_act_bwd)
 
 
-def block2d(params, x, *, stride=1, instance=False, legacy_abs=False):
+def block2d(params, x, *, stride=1, over="batch", legacy_abs=False):
     """`conv2d`, then `norm_act`."""
-    return norm_act(params.norm, conv2d(params.conv, x, stride=stride), instance=instance, legacy_abs=legacy_abs)
+    return norm_act(params.norm, conv2d(params.conv, x, stride=stride), over=over, legacy_abs=legacy_abs)

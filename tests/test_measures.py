@@ -1,0 +1,176 @@
+"""What each loss measures on a block of rays, and that what is missing counts in nothing."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import stage
+from stage import MINI, PAPER
+
+from zestjax import measures
+from zestjax.losses.objective import PAPER_WEIGHTS, Terms, measured
+from zestjax.measures import encoding_slots, make_measures, slot_valid, warped
+
+ALL = PAPER_WEIGHTS._replace(static_rec=1.0, mask=1.0, flow3d=1.0)
+
+
+@functools.cache
+def measure(config=PAPER, chain=False):
+    """Compiled: (params, inputs, evidence, truth) -> every term, the prediction, and the paths followed."""
+
+    def run(params, inputs, evidence, truth):
+        encoding = stage.encoded(params, inputs, evidence, config)
+        prediction = stage.render_rays(params, encoding, inputs, truth.pixels, config=config)
+        terms = make_measures(params, encoding, inputs, config=config, chain=chain)
+        paths = warped(params, encoding, inputs, prediction, config=config, chain=chain)
+        return measured(terms, prediction, truth, ALL), prediction, paths
+
+    return jax.jit(run)
+
+
+def case(config=PAPER):
+    """Arguments of `measure`, for every third ray."""
+    batch = stage.batch(config)
+    truth = jax.tree.map(lambda x: x[::3], batch.truth)
+    return stage.params_of(config), batch.inputs, batch.evidence, truth
+
+
+@pytest.fixture(scope="module")
+def found():
+    return jax.tree.map(lambda x: np.asarray(x, np.float64), measure()(*case()))
+
+
+def test_a_slot_is_known_by_its_time_and_validity():
+    slots = encoding_slots(stage.inputs_of(time=5)[0])
+    assert [float(slot_valid(slots, k)) for k in (-1, 0, 1, 2)] == [1, 1, 0, 0]
+    slots = encoding_slots(stage.inputs_of(time=0)[0])
+    assert [float(slot_valid(slots, k)) for k in (-1, 0, 1)] == [0, 1, 1]
+
+
+def test_all_terms_are_finite_and_not_negative(found):
+    terms = found[0]
+    for name, weight in ALL._asdict().items():
+        assert (getattr(terms, name) is None) == (weight is None), name
+        assert weight is None or (np.isfinite(getattr(terms, name)) and getattr(terms, name) >= 0), name
+
+
+def test_colour_terms_are_their_means(found):
+    terms, shown, _ = found
+    truth = case()[3]
+    np.testing.assert_allclose(terms.rec, np.mean((shown.colour - truth.colour) ** 2), rtol=1e-4)
+    static = np.mean((shown.static_colour - truth.static) ** 2, -1)
+    np.testing.assert_allclose(terms.static_rec, np.average(static, weights=truth.static_valid), rtol=1e-4)
+    share = 1e-3 + (1 - 2e-3) * shown.dynamicness
+    entropy = -(truth.moving * np.log(share) + (1 - truth.moving) * np.log(1 - share))
+    np.testing.assert_allclose(terms.mask, entropy.mean(), rtol=1e-4)
+
+
+def test_the_photometric_term_compares_each_neighbours_warped_colour(found):
+    terms, _, paths = found
+    each = paths.confidence[..., None] * (paths.colour - case()[3].colour) ** 2
+    assert paths.valid.tolist() == [1, 1] and paths.colour.shape[0] == 2
+    np.testing.assert_allclose(terms.pho, each.mean(), rtol=1e-4)
+
+
+def test_flow_terms_are_their_means_in_world_units(found):
+    terms, shown, paths = found
+    there, back = paths.there, paths.back
+    confidence = np.stack([shown.dynamic.confidence_forward, shown.dynamic.confidence_backward])
+    assert there.shape == (2, *shown.weights.shape, 3)
+    np.testing.assert_allclose(terms.min, np.abs(there).mean(), rtol=1e-4)
+    np.testing.assert_allclose(terms.temp, np.mean((there[0] + there[1]) ** 2), rtol=1e-3)
+    np.testing.assert_allclose(terms.cyc, np.mean(confidence[..., None] * np.abs(there + back)), rtol=1e-4)
+    np.testing.assert_allclose(terms.w, np.mean(1 - confidence), rtol=1e-3)
+
+
+def test_the_flow_of_what_moves_is_compared_near_its_surface(found):
+    terms, shown, paths = found
+    truth = case()[3]
+    near = np.exp(-(((shown.marched.depths / truth.depth[:, None] - 1) / 0.05) ** 2)) * truth.flow_valid[:, None]
+    error = [
+        np.minimum(np.abs(paths.there[i] - truth.flow[:, None, i]) / truth.depth[:, None, None], 1) for i in range(2)
+    ]
+    expected = 5 * sum(np.sum(near[..., None] * e) / max(3 * near.sum(), 1e-30) for e in error)
+    np.testing.assert_allclose(terms.flow3d, expected, rtol=1e-3, atol=1e-6)
+
+
+def test_a_neighbour_that_does_not_exist_counts_in_nothing():
+    params, inputs, evidence, truth = case()
+    alone = inputs._replace(slots=inputs.slots._replace(valid=np.zeros_like(inputs.slots.valid)))
+    terms, _, paths = measure()(params, alone, evidence, truth)
+    assert not paths.valid.any()
+    for name in ("pho", "w", "cyc", "min", "sp", "temp", "geo"):
+        assert getattr(terms, name) == 0, name
+
+
+def test_what_is_not_known_counts_in_nothing():
+    params, inputs, evidence, truth = case()
+    zero = lambda x: np.zeros_like(x)
+    nothing = truth._replace(
+        known=zero(truth.known), flow_valid=zero(truth.flow_valid), static_valid=zero(truth.static_valid),
+        depth=zero(truth.depth), flow=np.full_like(truth.flow, np.nan),
+    )  # fmt: skip
+    terms, _, _ = measure()(params, inputs, evidence, nothing)
+    for name in ("depth", "geo", "flow3d", "static_rec"):
+        assert getattr(terms, name) == 0, name
+
+
+def test_gradients_are_finite_where_nothing_is_known():
+    params, inputs, evidence, truth = case()
+    truth = truth._replace(
+        known=np.zeros_like(truth.known), flow_valid=np.zeros_like(truth.flow_valid), depth=np.zeros_like(truth.depth)
+    )
+    grads = gradient()(params, inputs, evidence, truth)
+    assert all(np.isfinite(g).all() for g in jax.tree.leaves(grads))
+
+
+@functools.cache
+def gradient():
+    """Compiled: the gradient of the sum of all terms in the parameters."""
+
+    def total(params, inputs, evidence, truth):
+        terms, _, _ = measure()(params, inputs, evidence, truth)
+        return sum(t for t in terms if t is not None)
+
+    return jax.jit(jax.grad(total))
+
+
+def test_smooth_terms_match_a_finite_difference_in_the_dynamic_field(x64):
+    """Along one direction of the field's parameters, in float64."""
+    config = dataclasses.replace(PAPER, geometry=False, motion=False)
+    to64 = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), tree)
+    params = to64(stage.params_of(config))
+    _, inputs, _, truth = to64(case())
+    rng = np.random.default_rng(0)
+    draw = lambda: jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)) / 10, params.dynamic)
+    direction = draw()
+    # Biases of 0 would put units whose inputs are all dead exactly on the kink of their ReLU.
+    params = params._replace(dynamic=jax.tree.map(jnp.add, params.dynamic, draw()))
+
+    def total(t):
+        moved = params._replace(dynamic=jax.tree.map(lambda x, d: x + t * d, params.dynamic, direction))
+        encoding = stage.encoded(moved, inputs, None, config)
+        prediction = stage.render_rays(moved, encoding, inputs, truth.pixels, config=config)
+        terms = make_measures(moved, encoding, inputs, config=config)
+        weights = Terms(rec=1.0, w=1.0, temp=1.0, mask=1.0)  # pho holds its weights, by design
+        return sum(v for v in measured(terms, prediction, truth, weights) if v is not None)
+
+    both = jax.jit(jax.value_and_grad(total))
+    numeric = (both(jnp.float64(1e-6))[0] - both(jnp.float64(-1e-6))[0]) / 2e-6
+    assert numeric != 0
+    np.testing.assert_allclose(both(jnp.float64(0))[1], numeric, rtol=1e-4)
+
+
+def test_at_a_neighbour_the_slots_are_named_from_its_own_time():
+    """At t + 1 the slot of time t + 1 is read where the point is, not one flow away."""
+    whole = stage.batch(MINI)
+    shift = lambda inputs: jax.eval_shape(
+        lambda p, i, e: stage.encoded(p, i, e, MINI), stage.params_of(MINI), inputs, whole.evidence
+    )
+    encoding = shift(whole.inputs)
+    encoding = encoding._replace(slots=encoding.slots._replace(times=np.array([-1.0, 0, 1])))
+    assert measures._seen_from(encoding, 1).slots.times.tolist() == [-2, -1, 0]
+    assert measures._seen_from(encoding._replace(slots=None), 1).slots is None
