@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
@@ -98,11 +98,12 @@ def train(options):
 def fresh(config, options):
     """A run's first `TrainState`, from the seed or from given weights, and its compiled step."""
     with jax.threefry_partitionable(False):  # the other form of the same generator compiles ten times longer here
-        params = init_params(jax.random.key(options.seed), config)
+        params: Any = init_params(jax.random.key(options.seed), config)
     if options.weights is not None:
         params, _ = load_weights(options.weights, like=params)
     if options.analysis is not None:
-        params = params._replace(analysis=load_weights(options.analysis, like=params)[0].analysis)
+        other: Any = load_weights(options.analysis, like=params)[0]
+        params = params._replace(analysis=other.analysis)
     weights = stage_weights(options.stage, weights=FRAMES_WEIGHTS if options.scenes else FRAME_WEIGHTS)
     init, step_fn = make_train_step(
         config, steps=options.steps, weights=weights, peak=options.peak, floor=options.peak / 100
@@ -118,10 +119,18 @@ def run_metadata(config, options):
     return {
         "preset": options.preset, "system": options.system, "config": config, "seed": options.seed,
         "steps": options.steps, "stage": options.stage, "peak": options.peak, "data": data,
-        "start": None if options.weights is None else str(options.weights),
-        "analysis": None if options.analysis is None else str(options.analysis), "zestjax": zestjax.__version__,
+        "start": _run_name(options.weights),
+        "analysis": _run_name(options.analysis), "zestjax": zestjax.__version__,
         "jax": jax.__version__, "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
     }  # fmt: skip
+
+
+def _run_name(weights):
+    """The run that a file of weights comes from, without the machine's folders; None of None."""
+    if weights is None:
+        return None
+    path = Path(weights)
+    return path.resolve().parent.name if path.stem == "weights" else path.stem
 
 
 def summarise(result, out, verb):
