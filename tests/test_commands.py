@@ -71,7 +71,7 @@ def test_stages_follow_one_another_and_real_scenes_serve_too(place, weights, sce
     own = ("train", "--preset", "tiny", "--scenes", scene, scene, "--steps", 3, "--out", place / "own")
     finish(place, *own, "--weights", place / "views/weights.safetensors")
     at = {name: load_weights(place / name / "weights.safetensors")[0] for name in ("whole", "frames", "views", "own")}
-    moved = lambda a, b: {name.split(".")[0] for name in at[a] if (at[a][name] != at[b][name]).any()}
+    moved = lambda a, b: {name.split(".")[1] for name in at[a] if (at[a][name] != at[b][name]).any()}
     assert moved("whole", "frames") == {"analysis"}
     assert "analysis" not in moved("frames", "views") and {"geometry", "motion", "static"} <= moved("frames", "views")
     assert moved("views", "own")

@@ -14,7 +14,7 @@ from zestjax.apps.weights import open_weights
 from zestjax.learn import make_train_step
 from zestjax.training import TrainState
 
-RATE = 5e-4
+RATE = 1e-4
 FOREVER = 1_000_000
 
 
