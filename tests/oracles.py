@@ -11,13 +11,16 @@ import pytest
 GOLDEN = Path(__file__).parents[2] / "shared" / "golden"
 
 
-def golden(name):
-    """Arrays recorded from the authors' functions, without their batch axis; skips where they are not at hand."""
+def golden(name, *, batch=False):
+    """Arrays recorded from the authors' functions, without their batch axis unless `batch`; skips where absent."""
     path = GOLDEN / name
     if not path.exists():
         pytest.skip(f"needs {Path('shared') / 'golden' / name} beside the repository")
     with np.load(path) as file:
-        return {key: file[key][0] if file[key].ndim > 1 and file[key].shape[0] == 1 else file[key] for key in file}
+        return {
+            key: file[key][0] if not batch and file[key].ndim > 1 and file[key].shape[0] == 1 else file[key]
+            for key in file
+        }
 
 
 def uniform(seed, *shape, low=0.0, high=1.0, dtype=jnp.float32):

@@ -8,6 +8,7 @@ import os
 import shutil
 from pathlib import Path
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -317,3 +318,51 @@ def test_cameras_that_the_layout_cannot_hold_are_refused(tmp_path):
     with pytest.raises(ValueError, match="camera 1 is another"):
         write_nsff(tmp_path / "scene", "off", video)
     assert not os.listdir(tmp_path)
+
+
+def photographs(folder, count, name="images_8"):
+    rng = np.random.default_rng(2)
+    for i in range(count):
+        write_image(folder / name / f"{i:03d}.png", rng.uniform(size=(12, 16, 3)).astype(np.float32))
+
+
+def test_llff_keeps_every_eighth_photograph_from_the_inputs(tmp_path):
+    photographs(tmp_path, 9)
+    pose = np.array([[0, 1, 0, 0, 12], [1, 0, 0, 0, 16], [0, 0, -1, 0, 20]], float)
+    np.save(tmp_path / "poses_bounds.npy", np.tile(np.concatenate([pose.reshape(-1), [1, 5]]), (9, 1)))
+    scene = load_scene(tmp_path)
+    assert scene.layout == "llff" and [t.time for t in scene.targets] == [0, 8]
+    assert all(t.exclude == (0, 8) and t.image.shape == (12, 16, 3) for t in scene.targets)
+    assert len(load_scene(tmp_path, protocol="strict").targets) == 9
+    (tmp_path / "mv_images").mkdir()
+    assert load_scene(tmp_path, protocol="strict").layout == "nsff"
+
+
+def test_idr_cameras_are_those_its_matrices_were_made_of(tmp_path):
+    photographs(tmp_path, 3, "image")
+    k, pose = np.array([[20, 0.1, 8], [0, 21, 6], [0, 0, 1]]), np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.array([0.1, -0.2, 0.3]))[0]
+    pose[:3, 3] = [0.5, -0.2, 7]
+    world, sphere = np.eye(4), np.diag([2.0, 2, 2, 1])
+    world[:3] = k @ pose[:3] * 3
+    arrays = {f"world_mat_{i}": world for i in range(3)} | {f"scale_mat_{i}": sphere for i in range(3)}
+    np.savez(tmp_path / "cameras_sphere.npz", **arrays)
+    scene = load_scene(tmp_path)
+    assert scene.layout == "idr" and [t.time for t in scene.targets] == [0]
+    np.testing.assert_allclose(scene.video.cameras.intrinsics[1], k, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(scene.video.cameras.camera_from_world[1], pose, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose([scene.video.near, scene.video.far], [5, 9], rtol=1e-5)
+    del arrays["world_mat_2"]
+    np.savez(tmp_path / "cameras_sphere.npz", **arrays)
+    with pytest.raises(ValueError, match="cameras_sphere.npz: should hold world_mat_i and scale_mat_i of 3 pictures"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("folder, layout, size", [("llff_fern/fern", "llff", 20), ("dtu_idr/dtu_scan24", "idr", 49)])
+def test_real_photographs_load(folder, layout, size):
+    path = Path(__file__).parents[2] / "shared" / "data" / folder
+    if not path.exists():
+        pytest.skip(f"needs shared/data/{folder} beside the repository")
+    scene = load_scene(path, height=24)
+    assert scene.layout == layout and scene.video.images.shape == (size, 24, 32, 3)
+    assert 0 < scene.video.near < scene.video.far and len(scene.targets) in (3, 4)

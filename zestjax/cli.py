@@ -58,7 +58,7 @@ def _prepare_jax():
 def _parser():
     parser = _Parser(prog="zestjax", description="Zero-shot novel views of dynamic video.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
-    for add in (_demo, _simulate, _train, _finetune, _render, _evaluate, _frontier):
+    for add in (_demo, _simulate, _train, _finetune, _render, _evaluate, _frontier, _import_mvsnerf):
         add(commands)
     return parser
 
@@ -145,6 +145,18 @@ def _frontier(commands):
     command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: four)")
 
 
+def _import_mvsnerf(commands):
+    about = "MVSNeRF's published weights as a file for render and evaluate"
+    command = commands.add_parser("import-mvsnerf", help=about, description=about)
+    command.add_argument("file", type=Path, metavar="FILE", help="the released checkpoint, or an npz of its arrays")
+    command.add_argument("--out", type=Path, required=True, metavar="WEIGHTS", help="file to write (.safetensors)")
+    command.add_argument(
+        "--statistics", default="batch", help="of the norms: batch (as published, the default) or stored"
+    )
+    command.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    command.set_defaults(run=_run_import_mvsnerf)
+
+
 def _scene_flags(command):
     command.add_argument("--scene", required=True, metavar="PATH", help="a scene's folder, or bench:NAME")
     command.add_argument("--format", metavar="NAME", help="layout of the folder (default: recognised)")
@@ -194,6 +206,12 @@ def _run_frontier(options):
     from zestjax.apps.frontier import FrontierOptions, frontier
 
     return frontier(FrontierOptions(**options)), True
+
+
+def _run_import_mvsnerf(options):
+    from zestjax.apps.weights import import_mvsnerf
+
+    return import_mvsnerf(options["file"], options["out"], statistics=options["statistics"]), True
 
 
 def _size(text):

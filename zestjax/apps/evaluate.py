@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax import floors, novel_view
+from zestjax import floors, mvsnerf, novel_view
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
 from zestjax.apps.tables import headline, write_table
-from zestjax.apps.weights import open_weights
+from zestjax.apps.weights import PUBLISHED, open_weights
 from zestjax.io.files import write_bytes
 from zestjax.io.inputs import check_target
 from zestjax.io.pictures import depth_picture, error_picture, share_picture, side_by_side, write_image
@@ -52,7 +52,7 @@ def evaluate(options):
     Raises:
       ValueError, WeightsError: a scene, a target or weights that cannot be used.
     """
-    model = open_weights(options.weights, system=options.system)
+    model = open_weights(options.weights, system=options.system, published=True)
     if options.scene != "bench:all":
         report = evaluate_scene(model, options, Path(options.out))
         return f"evaluate: {headline(report)}: {Path(options.out) / 'metrics.json'}"
@@ -102,8 +102,9 @@ class Renderer:
     def __init__(self, model, video, **changes):
         self.model, self.compile_seconds = model, None
         self.config = dataclasses.replace(model.config, **changes)
+        self.system = mvsnerf if model.system == PUBLISHED else novel_view
         self.video = jax.tree.map(jnp.asarray, video)
-        prepare = lambda: jax.block_until_ready(novel_view.prepare(model.params, self.video, config=model.config))
+        prepare = lambda: jax.block_until_ready(self.system.prepare(model.params, self.video, config=model.config))
         self.prepared, first = timed(prepare)
         self.prepared, self.prepare_seconds = timed(prepare)
         self.prepare_compile_seconds = max(0.0, first - self.prepare_seconds)
@@ -112,7 +113,7 @@ class Renderer:
         """(`View`, seconds)."""
         camera = jax.tree.map(jnp.asarray, camera)
         render = lambda: jax.block_until_ready(
-            novel_view.render_view(
+            self.system.render_view(
                 self.model.params, self.prepared, camera, frame_time, config=self.config, exclude=exclude
             )
         )

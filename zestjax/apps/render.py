@@ -49,7 +49,7 @@ def render(options):
     Raises:
       ValueError, WeightsError: a scene, a path or weights that cannot be used.
     """
-    model, out = open_weights(options.weights), Path(options.out)
+    model, out = open_weights(options.weights, published=True), Path(options.out)
     scene = open_scene(options.scene, model.config, size=options.size, protocol=None, layout=options.format).scene
     path = camera_path(options.path, scene.video, count=options.frames)
     views, timing = render_path(model, scene, path, budget=options.budget_seconds, quiet=options.quiet)

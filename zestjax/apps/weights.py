@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 
 import jax
 
-from zestjax.io.weights import WeightsError, load_weights, read_metadata
+from zestjax.io.mvsnerf import mvsnerf_like, read_mvsnerf
+from zestjax.io.weights import WeightsError, load_weights, read_metadata, save_weights
 from zestjax.model import init_params
+from zestjax.mvsnerf import MvsNerfConfig
 from zestjax.presets import Config
 
 SYSTEMS = {
@@ -20,11 +22,15 @@ SYSTEMS = {
 """What each system changes in a preset."""
 
 
+PUBLISHED = "mvsnerf"
+
+
 class Model(NamedTuple):
-    """params: learned arrays. config: `presets.Config`. system: str. path: the file. metadata: dict of the run."""
+    """params: learned arrays. config: `presets.Config` or `mvsnerf.MvsNerfConfig`. system: str. path: the file.
+    metadata: dict of the run."""
 
     params: Any
-    config: Config
+    config: Any
     system: str
     path: Path
     metadata: dict
@@ -54,12 +60,13 @@ def system_of(config):
     return next(name for name, c in SYSTEMS.items() if (c.get("geometry", True), c.get("motion", True)) == volumes)
 
 
-def open_weights(path=None, *, system=None):
+def open_weights(path=None, *, system=None, published=False):
     """Load weights and their configuration.
 
     Args:
       path: file; None: the shipped ones.
       system: refuse weights of another system.
+      published: MVSNeRF's weights, as `import-mvsnerf` writes them, will do as well.
 
     Returns:
       `Model`.
@@ -69,6 +76,11 @@ def open_weights(path=None, *, system=None):
     """
     path = Path(path) if path is not None else shipped_weights()
     metadata = read_metadata(path)
+    if metadata.get("system") == PUBLISHED:
+        if not published or system not in (None, PUBLISHED):
+            raise WeightsError(f"{path}: holds MVSNeRF's weights, which only `render` and `evaluate` can use.")
+        params, _ = load_weights(path, like=mvsnerf_like(statistics=metadata["statistics"]))
+        return Model(params, MvsNerfConfig(), PUBLISHED, path, metadata)
     try:
         config = config_from_json(metadata["config"])
     except (KeyError, TypeError, WeightsError) as error:
@@ -79,3 +91,18 @@ def open_weights(path=None, *, system=None):
     like = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
     params, _ = load_weights(path, like=like)
     return Model(params, config, found, path, metadata)
+
+
+def import_mvsnerf(path, out, *, statistics="batch"):
+    """Write MVSNeRF's published weights as a file that `render` and `evaluate` take.
+
+    Returns:
+      str, the summary line.
+
+    Raises:
+      WeightsError: see `io.mvsnerf.read_mvsnerf`; or the file could not be written.
+    """
+    params = read_mvsnerf(path, statistics=statistics)
+    save_weights(out, params, metadata={"system": PUBLISHED, "statistics": statistics, "start": Path(path).name})
+    count = sum(leaf.size for leaf in jax.tree.leaves(params))
+    return f"import-mvsnerf: {count:,} values, statistics of the {statistics}: {out}"

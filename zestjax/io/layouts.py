@@ -39,6 +39,7 @@ class Record:
     name, layout: str. images: N files in the order of time. cameras: `Camera` with (N, ...) numpy leaves at native
     size. size: (height, width) native. near, far: depth bounds, world units. motion_masks, disparity, flow_forward,
     flow_backward, truth: file by frame index, for the frames that have one. held_out: pictures of other cameras.
+    reserved: frames that the held-out protocol predicts, and keeps from all inputs, where photographs are all there is.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Record:
     flow_backward: Mapping[int, Path] = field(default_factory=dict)
     truth: Mapping[int, Path] = field(default_factory=dict)
     held_out: tuple[HeldOut, ...] = ()
+    reserved: tuple[int, ...] = ()
 
 
 def bounds_from_frames(bounds):

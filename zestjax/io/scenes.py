@@ -6,7 +6,8 @@
 
 A protocol says what the targets are:
 
-    held-out   pictures of other cameras than the one that took the frame of their time; all frames are inputs
+    held-out   pictures of other cameras than the one that took the frame of their time; all frames are inputs. Where
+               there are none: the frames that the layout reserves, which are then never inputs
     strict     frames of the video itself, each never among its own inputs
     paper      frames of the video itself, which are among the inputs: this leaks the answer, and is kept only to set
                figures beside the paper's
@@ -22,8 +23,10 @@ import numpy as np
 
 from zestjax.cameras import Camera, resized
 from zestjax.checks import check_option
+from zestjax.io.idr import is_idr, read_idr
 from zestjax.io.inputs import check_inputs
 from zestjax.io.layouts import select
+from zestjax.io.llff import is_llff, read_llff
 from zestjax.io.nrnerf import is_nrnerf, read_nrnerf
 from zestjax.io.nsff import is_nsff, read_nsff
 from zestjax.io.pictures import image_size, read_image, read_mask, resize_area, resize_nearest
@@ -31,7 +34,12 @@ from zestjax.video import Video
 
 PROTOCOLS = ("held-out", "strict", "paper")
 
-LAYOUTS = {"nsff": (is_nsff, read_nsff), "nrnerf": (is_nrnerf, read_nrnerf)}
+LAYOUTS = {
+    "idr": (is_idr, read_idr),
+    "llff": (is_llff, read_llff),
+    "nsff": (is_nsff, read_nsff),
+    "nrnerf": (is_nrnerf, read_nrnerf),
+}
 """By name: a function of the folder that recognises it, and one that reads it to a `zestjax.io.layouts.Record`."""
 
 
@@ -118,7 +126,7 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
     check_option("load_scene", protocol=(protocol, PROTOCOLS))
     path, layout = _found(path, layout)
     record = LAYOUTS[layout][1](path)
-    if protocol == "held-out" and not record.held_out:
+    if protocol == "held-out" and not (record.held_out or record.reserved):
         raise ValueError(f"{path}: has no pictures of other cameras (mv_images), so no held-out target; use `strict`.")
     if outside := [i for i in exclude if not 0 <= i < len(record.images)]:
         raise ValueError(f"{path}: no frame {outside[0]} to exclude; the video has 0 to {len(record.images) - 1}.")
@@ -131,7 +139,7 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
     video = Video._make((images, cameras, np.float32(record.near), np.float32(record.far)))
     check_inputs(str(path), video)
     masks = _stack(record.motion_masks, len(images), lambda file: resize_nearest(read_mask(file), *size))
-    listed = _other_views(record, size) if protocol == "held-out" else _own_views(record, video, masks, protocol)
+    listed = _listed(record, video, masks, protocol)
     return Scene(
         name=record.name,
         video=video,
@@ -180,7 +188,17 @@ def _resized(cameras, have, size):
     return Camera._make(map(np.asarray, resized(cameras, size[1] / have[1], size[0] / have[0])))
 
 
-def _own_views(record, video, masks, protocol):
+def _listed(record, video, masks, protocol):
+    """[((time, camera name), reader)] of a protocol's targets."""
+    if protocol != "held-out":
+        excluded = lambda time: (time,) if protocol == "strict" else ()
+        return _own_views(record, video, masks, range(len(video.images)), excluded)
+    if record.held_out:
+        return _other_views(record, video.images.shape[1:3])
+    return _own_views(record, video, masks, record.reserved, lambda time: record.reserved)
+
+
+def _own_views(record, video, masks, times, excluded):
     """[((time, camera name), reader)] of the video's own frames."""
 
     def read(time):
@@ -190,11 +208,11 @@ def _own_views(record, video, masks, protocol):
             camera=select(video.cameras, time),
             image=video.images[time],
             dynamic=None if masks is None else masks[time],
-            exclude=(time,) if protocol == "strict" else (),
+            exclude=excluded(time),
             **_truth(record.truth.get(time), video.images.shape[1:3]),
         )
 
-    return [((time, "input"), lambda time=time: read(time)) for time in range(len(video.images))]
+    return [((time, "input"), lambda time=time: read(time)) for time in times]
 
 
 def _other_views(record, size):
@@ -271,11 +289,7 @@ def _arrays(path):
 
 
 def _load(path, of=np.asarray):
-    """What a numpy file holds, read by `of`.
-
-    Raises:
-      ValueError: the file is missing or damaged.
-    """
+    """What a numpy file holds, read by `of`; a missing or damaged file is a ValueError."""
     try:
         return of(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:

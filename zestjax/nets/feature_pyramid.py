@@ -40,6 +40,13 @@ def init_feature_pyramid(key, *, widths=(8, 16, 32), n_in=3):
     return FeaturePyramid(tuple(blocks), init_conv2d(keys[8], 1, quarter, quarter))
 
 
+def imagenet_normalised(images):
+    """Images (..., 3) in [0, 1], centred and scaled by ImageNet's statistics."""
+    shape = (1,) * (images.ndim - 1) + (3,)
+    mean, deviation = (jnp.asarray(v, images.dtype).reshape(shape) for v in (IMAGENET_MEAN, IMAGENET_DEVIATION))
+    return (images - mean) / deviation
+
+
 def feature_pyramid(params, images, *, normalise="imagenet", legacy_abs=False):
     """Features of every view at a quarter of its size; feature pixel j sits on image pixel 4 j.
 
@@ -63,10 +70,7 @@ def feature_pyramid(params, images, *, normalise="imagenet", legacy_abs=False):
     """
     check_option("feature_pyramid", normalise=(normalise, ("imagenet", None)))
     check_shapes("feature_pyramid", kernel=(params.blocks[0].conv.kernel, "3 3 C wide"), images=(images, "V H W C"))
-    x = images
-    if normalise == "imagenet":
-        mean, deviation = (jnp.asarray(v, x.dtype) for v in (IMAGENET_MEAN, IMAGENET_DEVIATION))
-        x = (x - mean[None, None, None]) / deviation[None, None, None]
+    x = imagenet_normalised(images) if normalise == "imagenet" else images
     for block, stride in zip(params.blocks, STRIDES, strict=True):
         x = block2d(block, x, stride=stride, legacy_abs=legacy_abs)
     return conv2d(params.head, x)

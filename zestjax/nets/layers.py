@@ -2,7 +2,7 @@
 
 Vocabulary:
   kernel: the weights of a linear map; its last two axes are channels in and channels out.
-  norm-act: centre and scale by the statistics of the batch at hand (never running ones), scale and offset, leaky ReLU.
+  norm-act: centre and scale by the statistics of the batch at hand (or stored ones), scale and offset, leaky ReLU.
 
 Parameters are arrays only and float32 unless the caller casts them; what a layer is, is read off their shapes.
 """
@@ -42,16 +42,30 @@ class Conv(NamedTuple):
     bias: jax.Array | None
 
 
+class Statistics(NamedTuple):
+    """Stored statistics of published weights.
+
+    Attributes:
+      mean: (C,).
+      variance: (C,), >= 0.
+    """
+
+    mean: jax.Array
+    variance: jax.Array
+
+
 class Norm(NamedTuple):
-    """What follows the division by the batch's standard deviation.
+    """What follows the division by the standard deviation.
 
     Attributes:
       scale: (C,).
       offset: (C,).
+      statistics: used instead of the batch's; None, as everything trained here has it: the batch's.
     """
 
     scale: jax.Array
     offset: jax.Array
+    statistics: Statistics | None = None
 
 
 class Block(NamedTuple):
@@ -146,7 +160,7 @@ def norm_act(params, x, *, slope=0.01, over="batch", epsilon=1e-5, legacy_abs=Fa
     Mean and biased variance are centred, in two passes.
 
     Args:
-      params: a `Norm` of C channels.
+      params: a `Norm` of C channels; its `statistics`, if it has any, take the place of the batch's.
       x: (..., C).
       slope: of the activation below 0.
       over: what shares statistics. `batch`: every axis but the last, so that views of one scene are normalised
@@ -161,6 +175,10 @@ def norm_act(params, x, *, slope=0.01, over="batch", epsilon=1e-5, legacy_abs=Fa
     check_shapes("norm_act", scale=(params.scale, "C"), x=(x, "... C"))
     check_option("norm_act", over=(over, ("batch", "element", "channels")))
     scale = jnp.abs(params.scale) + epsilon if legacy_abs else params.scale
+    if params.statistics is not None:
+        rate = lax.rsqrt(params.statistics.variance + epsilon) * scale
+        out = add_bias(x * add_bias(jnp.zeros_like(x), rate), params.offset - params.statistics.mean * rate)
+        return jnp.where(out > 0, out, slope * out)
     if over == "channels":
         centred = x - jnp.mean(x, axis=-1, keepdims=True)
         unit = centred * lax.rsqrt(jnp.mean(jnp.square(centred), axis=-1, keepdims=True) + epsilon)
