@@ -16,7 +16,7 @@ LAYERS = [
     "rendering depth flow presets model prediction assembly",
     "losses",
     "adam schedules solve",
-    "metrics io simulate floors testing measures batches novel_view mvsnerf learn training",
+    "metrics lpips io simulate floors testing measures batches novel_view mvsnerf learn training",
     "apps cli",
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names.split()}

@@ -58,7 +58,7 @@ def _prepare_jax():
 def _parser():
     parser = _Parser(prog="zestjax", description="Zero-shot novel views of dynamic video.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
-    for add in (_demo, _simulate, _train, _finetune, _render, _evaluate, _frontier, _import_mvsnerf):
+    for add in (_demo, _simulate, _train, _finetune, _render, _evaluate, _frontier, _import_mvsnerf, _import_lpips):
         add(commands)
     return parser
 
@@ -136,6 +136,7 @@ def _evaluate(commands):
     command.add_argument("--system", help="refuse weights of another system")
     command.add_argument("--protocol", default="held-out", help="held-out, strict or paper (default held-out)")
     command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: all)")
+    command.add_argument("--lpips", type=Path, metavar="FILE", help="LPIPS's weights, from import-lpips (default: n/a)")
     command.add_argument("--no-pictures", dest="pictures", action="store_false", help="write metrics.json only")
 
 
@@ -155,6 +156,16 @@ def _import_mvsnerf(commands):
     )
     command.add_argument("--quiet", action="store_true", help="print nothing but errors")
     command.set_defaults(run=_run_import_mvsnerf)
+
+
+def _import_lpips(commands):
+    about = "torchvision's AlexNet and LPIPS's linear heads as a file for evaluate --lpips"
+    command = commands.add_parser("import-lpips", help=about, description=about)
+    command.add_argument("alexnet", type=Path, metavar="ALEXNET", help="torchvision's file, or an npz of its arrays")
+    command.add_argument("heads", type=Path, metavar="HEADS", help="the authors' alex.pth (v0.1), or an npz")
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="file to write (.safetensors)")
+    command.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    command.set_defaults(run=_run_import_lpips)
 
 
 def _scene_flags(command):
@@ -212,6 +223,12 @@ def _run_import_mvsnerf(options):
     from zestjax.apps.weights import import_mvsnerf
 
     return import_mvsnerf(options["file"], options["out"], statistics=options["statistics"]), True
+
+
+def _run_import_lpips(options):
+    from zestjax.io.lpips import import_lpips
+
+    return import_lpips(options["alexnet"], options["heads"], options["out"]), True
 
 
 def _size(text):

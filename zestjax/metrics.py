@@ -35,7 +35,7 @@ def psnr(image, truth, *, mask=None):
       ValueError: shapes do not match.
     """
     check_shapes("psnr", image=(image, "H W C"), truth=(truth, "H W C"))
-    error = _mean_where(jnp.mean((image - truth) ** 2, axis=-1), mask, where="psnr")
+    error = mean_where(jnp.mean((image - truth) ** 2, axis=-1), mask, where="psnr")
     return -10 * jnp.log10(jnp.maximum(error, 10 ** (-PSNR_CAP / 10)))
 
 
@@ -58,7 +58,7 @@ def ssim(image, truth, *, mask=None):
     if mask is not None:
         check_shapes("ssim", image=(similarity, "H W"), mask=(mask, "H W"))
         mask = mask[inside, inside]
-    return _mean_where(similarity[inside, inside], mask, where="ssim")
+    return mean_where(similarity[inside, inside], mask, where="ssim")
 
 
 def ssim_map(image, truth):
@@ -113,7 +113,7 @@ def depth_abs_rel(depth, truth, mask):
     known = jnp.isfinite(truth) & (truth > 0)
     relative = jnp.abs(depth - jnp.where(known, truth, 1)) / jnp.where(known, truth, 1)
     mask = known if mask is None else jnp.where(known, jnp.asarray(mask, depth.dtype), 0)
-    return _mean_where(relative, mask, where="depth_abs_rel")
+    return mean_where(relative, mask, where="depth_abs_rel")
 
 
 def endpoint_error(flow, truth, mask):
@@ -134,7 +134,7 @@ def endpoint_error(flow, truth, mask):
     known = jnp.all(jnp.isfinite(truth), axis=-1)
     error = jnp.linalg.norm(flow - jnp.where(known[..., None], truth, 0), axis=-1)
     mask = known if mask is None else jnp.where(known, jnp.asarray(mask, flow.dtype), 0)
-    return _mean_where(error, mask, where="endpoint_error")
+    return mean_where(error, mask, where="endpoint_error")
 
 
 def _window_moments(*moments):
@@ -160,7 +160,7 @@ def _window_moments(*moments):
     return mean_a, mean_b, *average(spread)
 
 
-def _mean_where(x, mask, *, where):
+def mean_where(x, mask, *, where):
     """Mean of x (H, W) under the mask, None for all; NaN when it is empty. x may be non-finite outside the mask."""
     if mask is None:
         return _mean(x)

@@ -21,6 +21,7 @@ from zestjax.apps.tables import headline, write_table
 from zestjax.apps.weights import PUBLISHED, open_weights
 from zestjax.io.files import write_bytes
 from zestjax.io.inputs import check_target
+from zestjax.io.lpips import load_lpips
 from zestjax.io.pictures import depth_picture, error_picture, share_picture, side_by_side, write_image
 
 LABELS = ("nearest input", "novel view", "truth", "error", "depth", "dynamicness")
@@ -39,6 +40,7 @@ class EvaluateOptions:
     targets: tuple | None = None
     format: str | None = None
     pictures: bool = True
+    lpips: Path | None = None
     seed: int = 0
     quiet: bool = False
 
@@ -79,9 +81,11 @@ def evaluate_scene(model, options, out):
 def score_scene(view_of, opened, options, out):
     """Score an opened scene's targets with its `Renderer`; see `evaluate_scene`."""
     scene, model, rows = opened.scene, view_of.model, []
+    lpips = None if options.lpips is None else load_lpips(options.lpips)
     for target in progress(scene.targets, scene.name, quiet=options.quiet):
         check_target(scene.name, scene.video, target.camera)
-        rows.append(evaluate_target(view_of, scene, target, opened.ceiling, out if options.pictures else None))
+        shown = out if options.pictures else None
+        rows.append(evaluate_target(view_of, scene, target, opened.ceiling, shown, lpips))
     height, width = scene.video.images.shape[1:3]
     report = {
         "scene": scene.name, "system": model.system, "protocol": options.protocol, "height": height, "width": width,
@@ -125,11 +129,11 @@ class Renderer:
         return view, seconds
 
 
-def evaluate_target(view_of, scene, target, ceiling, out):
+def evaluate_target(view_of, scene, target, ceiling, out, lpips=None):
     """One target's row of metrics.json under `row`, and its floors' and ceiling's scores; writes its picture."""
     view, seconds = view_of(target.camera, target.time, target.exclude)
     nearest, warped = floor_images(view_of.video, target)
-    score = lambda image: score_image(image, target.image, target.dynamic)
+    score = lambda image: score_image(image, target.image, target.dynamic, lpips=lpips)
     limit = None if ceiling is None else ceiling(target)
     name = f"pictures/{target.time:05d}_{target.camera_name}.png"
     if out is not None:

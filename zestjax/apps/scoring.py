@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax import metrics
+from zestjax.lpips import lpips as lpips_distance
 
 REGIONS = ("full", "dynamic", "static")
 LEAST_PIXELS = 64
@@ -20,17 +21,28 @@ def _measure(image, truth, mask):
     return metrics.psnr(image, truth, mask=mask), metrics.ssim(image, truth, mask=mask)
 
 
+@jax.jit
+def _lpips(params, image, truth):
+    return lpips_distance(params, image, truth)
+
+
+@jax.jit
+def _lpips_masked(params, image, truth, mask):
+    return lpips_distance(params, image, truth, mask=mask)
+
+
 _depth_error = jax.jit(metrics.depth_abs_rel)
 _flow_error = jax.jit(metrics.endpoint_error)
 
 
-def score_image(image, truth, dynamic=None):
-    """PSNR and SSIM of a picture by region; LPIPS is null: its weights are not part of the package.
+def score_image(image, truth, dynamic=None, *, lpips=None):
+    """PSNR, SSIM and LPIPS of a picture by region.
 
     Args:
       image: (H, W, 3) in [0, 1].
       truth: (H, W, 3) in [0, 1].
       dynamic: (H, W) bool of the moving pixels, or None when they are not known.
+      lpips: `LpipsParams`, or None: LPIPS is null.
 
     Returns:
       {region: {"psnr", "ssim", "lpips"} or None}.
@@ -44,7 +56,12 @@ def score_image(image, truth, dynamic=None):
     for region, mask in masks.items():
         if mask.sum() >= LEAST_PIXELS:
             psnr, ssim = _measure(image, truth, jnp.asarray(mask, jnp.float32))
-            scores[region] = {"psnr": number(psnr), "ssim": number(ssim), "lpips": None}
+            looks = None
+            if lpips is not None:
+                whole = region == "full"
+                looks = _lpips(lpips, image, truth) if whole else _lpips_masked(lpips, image, truth, jnp.asarray(mask))
+            distance = None if looks is None else number(looks)
+            scores[region] = {"psnr": number(psnr), "ssim": number(ssim), "lpips": distance}
     return scores
 
 

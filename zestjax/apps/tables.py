@@ -7,7 +7,7 @@ from zestjax.apps.scoring import REGIONS, better_floor, mean_scores, share_of_th
 from zestjax.io.files import write_bytes
 
 HEAD = (
-    "| scene | full PSNR / SSIM | dynamic | static | nearest | plane warp | ceiling | above the better floor "
+    "| scene | full PSNR / SSIM / LPIPS | dynamic | static | nearest | plane warp | ceiling | above the better floor "
     "(full / dynamic / static) | of the way | depth | flow px | s / frame |"
 )
 
@@ -51,7 +51,10 @@ def table_row(report):
         floor = better_floor(floors, region)
         known = mean.get(region) and floor is not None
         gains.append(f"{mean[region]['psnr'] - floor:+.2f}" if known else "–")
-    pairs = [f"{mean[r]['psnr']:.2f} / {_shown(mean[r]['ssim'], 3)}" if mean.get(r) else "–" for r in REGIONS]
+    pairs = [
+        f"{mean[r]['psnr']:.2f} / {_shown(mean[r]['ssim'], 3)} / {_lpips(mean[r])}" if mean.get(r) else "–"
+        for r in REGIONS
+    ]
     share = share_of_the_way(mean, floors, ceiling)
     cells = [
         report["scene"], *pairs, psnrs(floors["nearest_frame"]), psnrs(floors["plane_warp"]), psnrs(ceiling),
@@ -59,6 +62,11 @@ def table_row(report):
         _shown(mean["flow_epe_px"]), _shown(mean["seconds_per_frame"]),
     ]  # fmt: skip
     return "| " + " | ".join(cells) + " |"
+
+
+def _lpips(scores):
+    """LPIPS, which nothing else may stand for: its weights are not part of the package."""
+    return "n/a" if scores.get("lpips") is None else f"{scores['lpips']:.3f}"
 
 
 def _shown(value, digits=2):
