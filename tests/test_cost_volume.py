@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.test_util import check_grads
-from oracles import assert_finite, golden
+from oracles import assert_finite
 
 from zestjax import cameras, cost_volume, planesweep
 from zestjax.cameras import Camera
@@ -298,36 +298,3 @@ def test_wrong_arguments_are_refused():
         cost_volume.cost_volume(tables, homographies, grid, per_view=9)
     with pytest.raises(ValueError, match="multiple of 4, got 6 x 8"):
         cost_volume.quarter_colours(jnp.zeros((6, 8, 3)))
-
-
-def published(g):
-    """Inputs of MVSNeRF's recorded volume, in our layout."""
-    views = cameras.scaled(Camera(jnp.asarray(g["intrinsics"][:3]), jnp.asarray(g["w2cs"][:3])), 0.25, 0.25)
-    depths = planesweep.plane_depths(*g["near_far"], 16)
-    homographies = planesweep.homographies(jax.tree.map(lambda x: x[0], views), views, depths)
-    images = jnp.moveaxis(jnp.asarray(g["imgs_norm"][:3]), 1, -1)
-    features = jnp.moveaxis(jnp.asarray(g["feats_train"]), 1, -1)
-    return features, cost_volume.quarter_colours(images), homographies
-
-
-def test_the_published_volume_is_mvsnerfs_to_its_negative_variances():
-    g = golden("mvsnerf_golden.npz")
-    volume = jax.jit(lambda: cost_volume.mvsnerf_cost_volume(*published(g), padding=4))()
-    assert volume.min() < -50
-    np.testing.assert_allclose(jnp.moveaxis(volume, -1, 0), g["cost_pad4_train"], rtol=1e-3, atol=5e-3)
-
-
-def test_the_published_volume_may_keep_the_first_three_views_colours_only():
-    g = golden("zest_funcs_golden.npz")
-    features, images, matrices = (jnp.asarray(g[f"cv_{name}"]) for name in ("feats", "imgs", "proj"))
-    depths = jnp.asarray(g["cv_depth"])
-
-    @jax.jit
-    def volume_of(features, images):
-        homographies = matrices[None, ..., :3] * jnp.ones((8, 1, 1, 1))
-        homographies = homographies.at[..., 2].add(matrices[None, ..., 3] / depths[:, None, None])
-        colours = cost_volume.quarter_colours(images)
-        return cost_volume.mvsnerf_cost_volume(features, colours, homographies, padding=4, colour_views=3)
-
-    volume = volume_of(jnp.moveaxis(features, 1, -1), jnp.moveaxis(images, 1, -1))
-    np.testing.assert_allclose(jnp.moveaxis(volume, -1, 0), g["cv_cost"], rtol=1e-3, atol=5e-3)

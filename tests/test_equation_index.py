@@ -10,9 +10,11 @@ import pytest
 import zestjax
 
 INDEX = Path(zestjax.__file__).parent / "EQUATIONS.md"
-ROWS = [
-    tuple(cell.strip() for cell in line.strip("|\n ").split("|"))[:3] for line in INDEX.read_text().splitlines()[2:]
-]
+EQUATIONS, DIFFERENCES = (
+    [tuple(cell.strip() for cell in line.strip("| ").split("|")) for line in part.splitlines() if line[:1] == "|"][2:]
+    for part in INDEX.read_text().split("\n## ")
+)
+ROWS = [row[:3] for row in EQUATIONS]
 LISTED = sorted({function.rsplit(".", 1)[0] for _, _, function in ROWS})
 
 
@@ -45,3 +47,16 @@ def test_a_listed_module_has_a_row_for_every_equation_of_the_paper_it_cites(modu
 
 def test_rows_are_not_repeated():
     assert len(set(ROWS)) == len(ROWS)
+
+
+def test_every_numbered_equation_of_the_paper_has_a_row():
+    cited = {label for paper, label, _ in ROWS if paper == "ZeST-NeRF"}
+    assert cited == {f"eq. {i}" for i in range(1, 26)}
+
+
+@pytest.mark.parametrize("row", DIFFERENCES, ids=lambda row: row[0])
+def test_a_difference_is_told_where_it_is_made(row):
+    assert len(row) == 6 and all(row), row
+    module, name = row[5].rsplit(".", 1)
+    text = inspect.getdoc(getattr(importlib.import_module(module), name)) or ""
+    assert re.search(r"Source:|Reference:|Differs from", text), f"{row[5]} does not say what it is compared with"

@@ -91,7 +91,10 @@ def median_depth(weights, depths):
 
 
 def disparity_from_depth(depth, *, nearest=1e-6):
-    """1 / depth, with depths under `nearest` (world units) held there; 0 at an infinite depth."""
+    """1 / depth, with depths under `nearest` (world units) held there; 0 at an infinite depth.
+
+    Reference: ZeST-NeRF renderer.py `raw2outputs` (`disp_map`), which is 0 / 0 on an empty ray.
+    """
     return 1 / jnp.maximum(depth, nearest)
 
 

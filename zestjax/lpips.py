@@ -35,9 +35,13 @@ class LpipsParams(NamedTuple):
 
 def lpips_like():
     """Shapes and types of `LpipsParams`."""
-    array = lambda *shape: jax.ShapeDtypeStruct(shape, jnp.float32)
-    convolutions = tuple(Conv(array(size, size, *channels), array(channels[1])) for size, *channels in LAYERS)
-    return LpipsParams(convolutions, tuple(array(out) for *_, out in LAYERS))
+    array = lambda *shape: jnp.zeros(shape, jnp.float32)
+
+    def made():
+        convolutions = tuple(Conv(array(size, size, *channels), array(channels[1])) for size, *channels in LAYERS)
+        return LpipsParams(convolutions, tuple(array(out) for *_, out in LAYERS))
+
+    return jax.eval_shape(made)
 
 
 def alexnet_activations(params, image):
@@ -48,7 +52,7 @@ def alexnet_activations(params, image):
     for i, layer in enumerate(params.convolutions):
         if i in POOLED:
             x = lax.reduce_window(x, -jnp.inf, lax.max, (1, 3, 3, 1), (1, 2, 2, 1), "VALID")
-        padding, stride = [(PADDING[i],) * 2] * 2, (STRIDES[i],) * 2
+        padding, stride = [(PADDING[i], PADDING[i])] * 2, (STRIDES[i],) * 2
         x = lax.conv_general_dilated(x, layer.kernel, stride, padding, dimension_numbers=IMAGES)
         x = jax.nn.relu(x + layer.bias[None, None, None])
         found.append(x[0])
@@ -68,7 +72,7 @@ def lpips_maps(params, image, truth):
 def lpips(params, image, truth, *, mask=None):
     """LPIPS distance of two pictures, 0 for equal ones.
 
-    Source: Zhang et al. 2018, eq. 1, weights of version 0.1.
+    Source: LPIPS (Zhang et al. 2018) eq. 1, weights of version 0.1.
     Differs from the reference: images are in [0, 1]; released ZeST-NeRF feeds such to a network that expects [-1, 1],
       which lowers its figures.
 

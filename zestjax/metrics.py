@@ -23,6 +23,8 @@ SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
 def psnr(image, truth, *, mask=None):
     """Peak signal-to-noise ratio in dB for values in [0, 1], at most `PSNR_CAP`.
 
+    Source: ZeST-NeRF eq. 23, eq. 24.
+
     Args:
       image: (H, W, C) scored picture.
       truth: (H, W, C) what it should be.
@@ -67,7 +69,7 @@ def ssim_map(image, truth):
     Gaussian window 11 x 11 of sigma 1.5, images mirrored at the border, biased variances. Variances are centred in each
     window, first along the rows and then across them, so that a flat patch has variance 0 and not rounding.
 
-    Source: Wang et al. 2004, eq. 13; the settings are the paper's own (Gaussian weights, K1 = 0.01, K2 = 0.03).
+    Source: ZeST-NeRF eq. 25; SSIM (Wang et al. 2004) with its own settings (Gaussian weights, K1 = 0.01, K2 = 0.03).
     Differs from the reference: the released ZeST-NeRF code averages a window of 5.
 
     Args:

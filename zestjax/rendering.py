@@ -208,11 +208,13 @@ def blend_weights_from_density(static_density, dynamic_density, blend, lengths, 
 def composite(weights, values, *, background=None):
     """Weighted sum of `values` along the ray, over an optional background.
 
+    Reference: ZeST-NeRF renderer.py `raw2outputs`.
+    Differs from the reference: its renders of warped samples stand on white by a slip of arguments.
+
     Args:
       weights: (..., S), from `weights_from_density` or a field of `Blended`.
       values: tree whose leaves are (..., S, C).
-      background: tree like `values` with leaves that broadcast to (..., C), seen through what opacity
-        leaves; None leaves it black.
+      background: tree like `values`, leaves broadcast to (..., C), seen through what opacity leaves; None: black.
 
     Returns:
       `Rendered`.

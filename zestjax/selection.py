@@ -70,6 +70,9 @@ def key_frames(positions, count, *, target=None, time=0, choice="nearest", exclu
 def slots(frames, time, *, offsets, exclude=()):
     """The neighbours of a time: frames time + offsets, each with a validity bit.
 
+    Source: ZeST-NeRF section 3.1 (M neighbours of the target frame).
+    Differs from the reference: it repeats the end frames, the target's own among them, as if they were neighbours.
+
     Args:
       frames: N.
       time: int target time.

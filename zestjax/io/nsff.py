@@ -8,7 +8,8 @@ Under the scene's folder, or `dense/` in it:
     mv_masks/00000/cam00.png    their moving pixels
     motion_masks/00000.png      moving pixels of the frames
     disp/00000.npy              (H, W) disparity, up to scale and shift (an inverse depth when simulated)
-    flow_i1/00000_fwd.npz       `flow` (H, W, 2) pixels and `mask` (H, W) towards the next frame; `_bwd` the previous
+    flow_i1/00000_fwd.npz       `flow` (H, W, 2) pixels and `mask` (H, W) towards the next frame; `_bwd` the previous;
+                                or 00000_fwd.flo
 
 and, where the truth is known, `truth/00000.npz` by frame and `truth/00000_cam00.npz` by held-out picture (`depth`,
 `flow`, and its camera), with `scene.json` for the name and the exact depth bounds.
@@ -177,7 +178,7 @@ def _one_each(folder, listing, images):
 
 
 def _flows(root, direction):
-    matches = ((re.fullmatch(rf"(\d+)_{direction}\.npz", p.name), p) for p in (root / "flow_i1").glob("*.npz"))
+    matches = ((re.fullmatch(rf"(\d+)_{direction}\.(npz|flo)", p.name), p) for p in (root / "flow_i1").glob("*"))
     return {int(match[1]): path for match, path in matches if match}
 
 

@@ -23,6 +23,7 @@ import numpy as np
 
 from zestjax.cameras import Camera, resized
 from zestjax.checks import check_option
+from zestjax.io.flow_files import read_flo
 from zestjax.io.idr import is_idr, read_idr
 from zestjax.io.inputs import check_inputs
 from zestjax.io.layouts import select
@@ -102,7 +103,9 @@ class Scene:
 
 
 def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out", targets=None, exclude=()):
-    """Read a scene from a folder.
+    """Read a scene from a folder; the protocol `paper` is the released ZeST-NeRF's.
+
+    Differs from the reference: frames that are predicted are never among the inputs, but with `paper`.
 
     Args:
       path: a folder in one of the layouts of `LAYOUTS`, or one that holds a single such folder, up to two levels below.
@@ -283,9 +286,9 @@ def _stack(files, count, read):
     return np.stack([read(files[i]) for i in range(count)]) if all(i in files for i in range(count)) else None
 
 
-def _arrays(path):
-    """The arrays of an npz file, by name."""
-    return _load(path, dict)
+def _arrays(path) -> dict:
+    """The arrays of an npz file, by name, or of a .flo file."""
+    return dict(zip(("flow", "mask"), read_flo(path), strict=True)) if path.suffix == ".flo" else _load(path, dict)
 
 
 def _load(path, of=np.asarray):
