@@ -1,12 +1,12 @@
-"""The published formulas as slow float64 loops, and the checks every numerical function gets."""
+"""The published formulas as slow float64 loops, recorded arrays, and the checks every numerical function gets."""
 
-import functools
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
+from zestjax.testing import assert_finite, assert_grads_match, value_and_gradients  # noqa: F401
 
 GOLDEN = Path(__file__).parents[2] / "shared" / "golden"
 
@@ -31,37 +31,6 @@ def uniform(seed, *shape, low=0.0, high=1.0, dtype=jnp.float32):
 def normal(seed, *shape, dtype=jnp.float32):
     """Drawn by numpy, which compiles nothing."""
     return jnp.asarray(np.random.default_rng(seed).normal(size=shape), dtype)
-
-
-@functools.cache
-def value_and_gradients(fn, count):
-    """A compiled function, kept: values and the gradients of their sum in each of `count` arguments."""
-    total = lambda *args: sum(jnp.sum(x) for x in jax.tree.leaves(fn(*args)))
-    return jax.jit(lambda *args: (fn(*args), jax.grad(total, argnums=tuple(range(count)))(*args)))
-
-
-def assert_finite(fn, *args):
-    """Values and the gradients of their sum are finite, at and in every argument."""
-    for leaf in jax.tree.leaves(value_and_gradients(fn, len(args))(*args)):
-        assert np.isfinite(leaf).all(), leaf
-
-
-def assert_grads_match(fn, *args, step=1e-6):
-    """The gradient along a random direction agrees with a central difference; float64 arguments, `x64` fixture."""
-    assert all(x.dtype == jnp.float64 for x in jax.tree.leaves(args))
-    rng = np.random.default_rng(99)
-    draw = lambda x: jnp.asarray(rng.normal(size=x.shape))
-    direction = jax.tree.map(draw, args)
-    mix = jax.tree.map(draw, jax.eval_shape(fn, *args))
-
-    @jax.jit
-    def both(t):
-        moved = lambda t: jax.tree.map(lambda x, d: x + t * d, args, direction)
-        weigh = lambda t: sum(jax.tree.leaves(jax.tree.map(lambda w, x: jnp.sum(w * x), mix, fn(*moved(t)))))
-        return jax.value_and_grad(weigh)(t)
-
-    numeric = (both(jnp.asarray(step, np.float64))[0] - both(jnp.float64(-step))[0]) / (2 * step)
-    np.testing.assert_allclose(both(jnp.asarray(0, np.float64))[1], numeric, rtol=1e-5, atol=1e-7)
 
 
 def weights_by_loop(density, lengths):

@@ -158,7 +158,7 @@ def sure():
 @pytest.mark.parametrize("level", [0.0, 1.0])
 def test_costs_stay_in_range_with_finite_gradients(scale, level):
     image, hom = jnp.full((6, 8, 3), level), shifts([(0, 0), (0, 0)]) * scale
-    values, gradients = value_and_gradients(all_costs, 4)(image, hom, 1e3 * level * (zero_flow() + 1), sure())
+    values, gradients = value_and_gradients(all_costs, image, hom, 1e3 * level * (zero_flow() + 1), sure())
     for cost in values:
         assert (cost >= 0).all() and (cost <= 1).all()
     for leaf in gradients:

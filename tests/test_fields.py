@@ -87,7 +87,7 @@ def test_the_gap_says_how_far_a_views_surface_lies_in_front():
 @pytest.mark.parametrize("sign", [1, -1])
 def test_views_of_points_anywhere_are_finite_with_finite_gradients(scale, sign):
     tables = jnp.concatenate([jnp.ones((1, 8, 12, 5)), jnp.full((1, 8, 12, 1), 1e-6)], -1)
-    values, gradients = value_and_gradients(sampled, 2)(tables, sign * scale * uniform(0, 1, 4, 3))
+    values, gradients = value_and_gradients(sampled, tables, sign * scale * uniform(0, 1, 4, 3))
     for leaf in jax.tree.leaves((values, gradients)):
         assert np.isfinite(leaf).all()
 
@@ -267,7 +267,7 @@ def seen(dtype=jnp.float32):
 def test_fields_are_bounded_and_finite_with_finite_gradients(gap, moving, visible, volume):
     fill = lambda x: jnp.full((V, P), x)
     args = (visible * seen()[0], fill(visible), fill(moving), fill(gap), jnp.full((P, CHANNELS), volume))
-    values, gradients = value_and_gradients(both, 5)(*args)
+    values, gradients = value_and_gradients(both, *args)
     for leaf in jax.tree.leaves((values, gradients)):
         assert np.isfinite(leaf).all()
     for field in values:

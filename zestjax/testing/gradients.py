@@ -1,0 +1,117 @@
+"""Checks for a loss of one's own: is it finite, and is its gradient its slope?"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zestjax.testing.walk import contains, program, run
+
+UNSEEN = ("while", "cond")  # what is inside them is not held
+
+
+def assert_finite(fn, *args):
+    """Values and the gradients of their sum are finite, at and in every argument.
+
+    Args:
+      fn: any function over pytrees of floating-point arrays.
+      *args: where it is asked.
+
+    Raises:
+      AssertionError: naming the first leaf of the value or of an argument's gradient that is not finite.
+    """
+    value, grads = value_and_gradients(fn, *args)
+    found = [("the value", value), *((f"the gradient of argument {i}", grad) for i, grad in enumerate(grads))]
+    for what, tree in found:
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+            bad = int(np.sum(~np.isfinite(np.asarray(leaf, np.float64))))
+            if bad:
+                raise AssertionError(
+                    f"assert_finite: {what}{jax.tree_util.keystr(path)} has {bad} of {leaf.size} entries that are not "
+                    "finite; `explain_gradient` finds where they begin."
+                )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def value_and_gradients(fn, *args):
+    """(fn(*args), the gradient of the sum of its value in every argument), compiled once for a function and shapes."""
+    total = lambda *args: sum(jnp.sum(x) for x in jax.tree.leaves(fn(*args)))
+    return fn(*args), jax.grad(total, argnums=tuple(range(len(args))))(*args)
+
+
+def held(fn, *args):
+    """The function whose slope at `args` is the gradient: what passes a `stop_gradient` keeps its value there.
+
+    Args:
+      fn: function over pytrees.
+      *args: the point.
+
+    Returns:
+      A function of the same arguments; it equals `fn` at `args`, and everywhere if `fn` stops no gradient.
+
+    Raises:
+      NotImplementedError: a `stop_gradient` inside `lax.while_loop` or `lax.cond`.
+    """
+    closed, leaves, tree = program(fn, *args)
+    if not contains(closed, "stop_gradient"):
+        return fn
+    values = []
+
+    def record(equation, _, outputs):
+        if equation.primitive.name in UNSEEN and any(contains(j, "stop_gradient") for j in _branches(equation)):
+            raise NotImplementedError(f"held: a stop_gradient inside `{equation.primitive.name}` cannot be held.")
+        if equation.primitive.name == "stop_gradient":
+            values.append(outputs)
+        return outputs
+
+    run(closed, leaves, record)
+
+    def again(*args):
+        kept = iter(values)
+        replay = lambda equation, _, out: next(kept) if equation.primitive.name == "stop_gradient" else out
+        return jax.tree.unflatten(tree, run(closed, jax.tree.leaves(args), replay))
+
+    return again
+
+
+def _branches(equation):
+    params = equation.params
+    return [*params.get("branches", ()), *(params[n] for n in ("cond_jaxpr", "body_jaxpr") if n in params)]
+
+
+def assert_grads_match(fn, *args, step=1e-6, directions=3, rtol=1e-5, atol=1e-7, seed=0):
+    """The gradient of a random mix of a function's outputs is its slope, by central differences in float64.
+
+    Arguments are raised to float64 for the check, whatever they are, and 64 bits are switched on for it alone. What
+    passes a `stop_gradient` is held while the arguments move, as its gradient does.
+
+    Args:
+      fn: any function over pytrees of floating-point arrays.
+      *args: where it is asked. Keep away from kinks (the corner of an absolute value), where no slope exists.
+      step: of the differences, in units of the arguments.
+      directions: random directions in which slopes are compared.
+      rtol: tolerance, relative.
+      atol: tolerance, absolute.
+      seed: draws directions and mix.
+
+    Raises:
+      AssertionError: a slope disagrees; gives both.
+    """
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(seed)
+        args = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float64), args)
+        draw = lambda x: jnp.asarray(rng.normal(size=x.shape))
+        mix = jax.tree.map(draw, jax.eval_shape(fn, *args))
+        weigh = lambda out: sum(jax.tree.leaves(jax.tree.map(lambda w, x: jnp.sum(w * x), mix, out)))
+        still = held(fn, *args)
+        moved = lambda t, way: jax.tree.map(lambda x, d: x + t * d, args, way)
+        value = jax.jit(lambda t, way: weigh(still(*moved(t, way))))
+        slope = jax.jit(lambda way: jax.grad(lambda t: weigh(fn(*moved(t, way))))(jnp.float64(0)))
+        for _ in range(directions):
+            way = jax.tree.map(draw, args)
+            numeric = (value(jnp.float64(step), way) - value(jnp.float64(-step), way)) / (2 * step)
+            np.testing.assert_allclose(
+                slope(way), numeric, rtol=rtol, atol=atol,
+                err_msg="assert_grads_match: the gradient (first) is not the slope of central differences (second)",
+            )  # fmt: skip
