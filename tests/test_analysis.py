@@ -127,3 +127,9 @@ def test_what_moves_stands_on_the_still_surface_below_it():
 def test_constant_evidence_gives_finite_maps_and_gradients(analysed, value):
     for leaf in jax.tree.leaves(analysed[1](jax.tree.map(lambda x: np.full_like(x, value), evidence()))):
         assert np.isfinite(leaf).all()
+
+
+def test_told_that_nothing_moves_the_maps_say_so(analysed):
+    maps = jax.jit(lambda e: frame_maps(analysed[0], e, still=True))(evidence())
+    assert bool(jnp.all(jax.nn.sigmoid(maps.moving_logits) < 1e-12))
+    assert all(bool(jnp.all(jnp.isfinite(x))) for x in maps)

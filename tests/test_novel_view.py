@@ -1,5 +1,6 @@
 """Novel views of a prepared video: whole images, whatever their size, and frames that serve nothing."""
 
+import dataclasses
 import functools
 
 import jax
@@ -130,3 +131,12 @@ def test_what_is_static_does_not_flow():
     flow = lambda share: novel_view._optical_flow(prediction(share), encoding_frustum, CAMERA, None, MINI)
     np.testing.assert_array_equal(flow(0.0), 0)
     assert (flow(1.0)[:, 0] > 0.5).all()
+
+
+def test_told_that_nothing_moves_the_dynamic_branch_is_not_in_the_program(scene, view):
+    config = dataclasses.replace(MINI, dynamic=False, motion=False)
+    params = scene[0]._replace(motion=None, dynamic=None)
+    still = render_view(params, prepare(params, stage.video(), config=config), CAMERA, 2, config=config)
+    assert still.dynamic is None and still.flow is None and not still.dynamicness.any()
+    assert same(still.colour, still.static) and np.isfinite(still.colour).all()
+    assert still.colour.shape == view.colour.shape

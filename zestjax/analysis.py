@@ -26,6 +26,7 @@ SUMMARIES = 2 * COSTS + 4
 STATIC_AROUND = 3  # of the costs, the static one averaged over its surroundings
 STANDING = (0.25, 0.5)  # static costs above which a cell is taken to be what moves, when looking for what it stands on
 MOVING_PARTS = 4  # a mask value for each half-resolution pixel of a cell
+NEVER = -30.0  # logit of moving where nothing does
 
 
 class AnalysisParams(NamedTuple):
@@ -109,7 +110,7 @@ def _channels(evidence, costs, ground, still):
     return jnp.concatenate([*parts, 8 * evidence.flow - 4, 2 * evidence.sure - 1, 2 * evidence.colours - 1], -1)
 
 
-def frame_maps(params, evidence):
+def frame_maps(params, evidence, *, still=False):
     """Depth, moving pixels and features of each frame from its evidence.
 
     A cell's surface stands still or moves, with the probability of its mask; either way it has a distribution over
@@ -119,6 +120,7 @@ def frame_maps(params, evidence):
     Args:
       params: `AnalysisParams`.
       evidence: `evidence.Evidence` with a leading axis V.
+      still: nothing moves, whatever the net says: surfaces are those that stand.
 
     Returns:
       `FrameMaps`.
@@ -128,8 +130,8 @@ def frame_maps(params, evidence):
     evidence = jax.tree.map(lambda x: x.astype(jnp.float32), evidence)
     costs = jax.lax.stop_gradient(_costs(evidence))
     planes = costs.shape[-1]
-    ground, still = jax.lax.stop_gradient(_ground(costs))
-    out = unet2d(params.net, _channels(evidence, costs, ground, still))
+    ground, standing = jax.lax.stop_gradient(_ground(costs))
+    out = unet2d(params.net, _channels(evidence, costs, ground, standing))
     parts = jnp.split(out, np.cumsum([planes, planes, COSTS, 1, 1, MOVING_PARTS]), axis=-1)
     still_free, moving_free, gains, place, sharpness, moving, features = parts
     gains = jax.nn.softplus(4 * gains + math.log(math.expm1(GAIN)))
@@ -138,6 +140,7 @@ def frame_maps(params, evidence):
     away = jnp.abs(index - ground[0][..., None] - place)
     standing = still_free - functools.reduce(operator.add, believed[:STILL_COSTS])
     moved = moving_free - functools.reduce(operator.add, believed[STILL_COSTS:])
+    moving = jnp.full_like(moving, NEVER) if still else moving
     moved = moved - 10 * jax.nn.softplus(4 * sharpness) * away
     moves = jnp.mean(moving, axis=-1, keepdims=True)
     logits = _mixed(standing, moved, moves)

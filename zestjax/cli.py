@@ -127,6 +127,7 @@ def _render(commands):
     command.add_argument("--path", default="orbit", help="orbit, spiral, wander, freeze, frames, or a file")
     command.add_argument("--frames", type=_positive, help="of the path (default: twice the video's)")
     command.add_argument("--budget-seconds", type=_positive_float, metavar="S", help="for all frames: renders smaller")
+    command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
     command.add_argument("--fps", type=_positive_float, default=12.0)
 
 
@@ -136,6 +137,7 @@ def _evaluate(commands):
     command.add_argument("--system", help="refuse weights of another system")
     command.add_argument("--protocol", default="held-out", help="held-out, strict or paper (default held-out)")
     command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: all)")
+    command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
     command.add_argument("--lpips", type=Path, metavar="FILE", help="LPIPS's weights, from import-lpips (default: n/a)")
     command.add_argument("--no-pictures", dest="pictures", action="store_false", help="write metrics.json only")
 

@@ -145,7 +145,7 @@ def whitened(values, mask, *, floor=FLAT):
     seen = jnp.where(mask > 0, values - centre[..., None], 0)
     count = jnp.sum(mask, axis=-1)
     spread = jnp.sum(jnp.abs(seen) * mask, axis=-1) / jnp.where(count > 0, count, 1)
-    least = floor * jnp.abs(centre) + jnp.finfo(values.dtype).tiny ** 0.5
+    least = floor * jnp.abs(centre) + float(jnp.finfo(values.dtype).tiny) ** 0.5
     usable = (count > 0) & (spread > least)
     spread = jnp.maximum(spread, least)
     return Whitened(values=seen / spread[..., None], centre=centre, spread=spread, usable=usable)
@@ -172,7 +172,7 @@ def align_least_squares(values, target, mask):
     values_mean, target_mean = mean(values), mean(target)
     centred = jnp.where(mask > 0, values - values_mean[..., None], 0)
     unit = jax.lax.stop_gradient(jnp.max(jnp.abs(centred), axis=-1))
-    varied = unit > 4 * jnp.finfo(values.dtype).eps * jnp.abs(values_mean)
+    varied = unit > 4 * float(jnp.finfo(values.dtype).eps) * jnp.abs(values_mean)
     unit = jnp.where(varied, unit, 1)
     centred = centred / unit[..., None]
     variance, covariance = mean(centred**2), mean(centred * (target - target_mean[..., None]))

@@ -222,9 +222,9 @@ def render(params, built, sources, camera, pixels, *, depths=None, padding, samp
     return Rendered(shown.values, expected_depth(weights, depths, background=0.0), shown.opacity)
 
 
-def prepare(params, video, *, config):
+def prepare(params, video, *, config, exclude=()):
     """Nothing is known of a scene before a view is asked for; see `novel_view.prepare`."""
-    del params, config
+    del params, config, exclude
     return video
 
 

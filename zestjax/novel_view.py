@@ -47,9 +47,9 @@ class View(NamedTuple):
     flow: jax.Array | None
 
 
-@jax.jit
-def _maps(params, evidence):
-    return frame_maps(params, dequantised(evidence))
+@functools.partial(jax.jit, static_argnames="still")
+def _maps(params, evidence, *, still):
+    return frame_maps(params, dequantised(evidence), still=still)
 
 
 def _frame_maps(params, seen, video, config, *, frames=None, exclude=()):
@@ -58,16 +58,18 @@ def _frame_maps(params, seen, video, config, *, frames=None, exclude=()):
     evidence = video_evidence(
         seen, video.cameras, video.near, video.far, planes=config.evidence_planes, frames=used, exclude=exclude
     )
-    return _maps(params.analysis, evidence if place is None else jax.tree.map(lambda x: x[place], evidence))
+    evidence = evidence if place is None else jax.tree.map(lambda x: x[place], evidence)
+    return _maps(params.analysis, evidence, still=not config.dynamic)
 
 
-def prepare(params, video, *, config):
+def prepare(params, video, *, config, exclude=()):
     """What a scene is asked for every view: each frame's own depth and moving pixels.
 
     Args:
       params: `model.ZestParams`.
       video: `Video`.
       config: `presets.Config`.
+      exclude: see the header.
 
     Returns:
       `Prepared`.
@@ -76,7 +78,7 @@ def prepare(params, video, *, config):
     if params.analysis is None:
         return Prepared(video, None, None)
     seen = footage(video.images)
-    return Prepared(video, seen, _frame_maps(params, seen, video, config))
+    return Prepared(video, seen, _frame_maps(params, seen, video, config, exclude=exclude))
 
 
 def render_view(params, prepared, camera, time, *, config, exclude=()):

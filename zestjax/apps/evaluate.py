@@ -18,7 +18,7 @@ from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
 from zestjax.apps.tables import headline, write_table
-from zestjax.apps.weights import PUBLISHED, open_weights
+from zestjax.apps.weights import PUBLISHED, open_weights, standing_still
 from zestjax.io.files import write_bytes
 from zestjax.io.inputs import check_target
 from zestjax.io.lpips import load_lpips
@@ -41,6 +41,7 @@ class EvaluateOptions:
     format: str | None = None
     pictures: bool = True
     lpips: Path | None = None
+    still: bool = False
     seed: int = 0
     quiet: bool = False
 
@@ -75,6 +76,7 @@ def evaluate_scene(model, options, out):
     """
     opened = open_scene(options.scene, model.config, size=options.size, protocol=options.protocol,
                         targets=options.targets, layout=options.format)  # fmt: skip
+    model = standing_still(model) if options.still else model
     return score_scene(Renderer(model, opened.scene.video), opened, options, out)
 
 

@@ -1,20 +1,30 @@
-"""`zestjax finetune`: weights adapted to one scene by predicting its own frames, each from the others."""
+"""`zestjax finetune`: weights adapted to one scene by predicting what stands still in its frames from other frames.
+
+A frame that is held back has no picture of its own time to be predicted from, as the views asked for later have: what
+moves would learn to fade. It is therefore left out, as far as the frames' own analysis finds it.
+"""
 
 import dataclasses
 from pathlib import Path
 
+import cv2
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from zestjax import novel_view
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.train import summarise
 from zestjax.apps.weights import open_weights
 from zestjax.learn import make_train_step
+from zestjax.losses.objective import Terms
 from zestjax.training import TrainState
 
-RATE = 1e-4
+RATE = 1e-3
+STILL_WEIGHTS = Terms(static_rec=20.0)
+MOVING = 0.3  # probability of moving from which a pixel is left out, and its surroundings with it
 FOREVER = 1_000_000
 
 
@@ -51,15 +61,26 @@ def finetune(options):
     video = opened.scene.video
     if len(video.images) - len(set(options.exclude)) < 3:
         raise ValueError(f"finetune: --exclude leaves too few of {len(video.images)} frames; leave at least 3.")
-    init, step_fn = make_train_step(
-        model.config, steps=FOREVER, weights=FRAMES_WEIGHTS, peak=RATE, floor=RATE, warmup=5
-    )  # fmt: skip
+    moving = moving_pixels(model, video, options.exclude)
+    weights = FRAMES_WEIGHTS if moving is None else STILL_WEIGHTS
+    init, step_fn = make_train_step(model.config, steps=FOREVER, weights=weights, peak=RATE, floor=RATE, warmup=5)
     params = jax.tree.map(jnp.array, model.params)  # copies: the step donates
     loop = LoopOptions(options.out, options.steps, options.budget, options.resume, 60.0, quiet=options.quiet)
     metadata = model.metadata | {
         "seed": options.seed, "start": str(model.path),
         "data": {"scene": str(options.scene), "exclude": list(options.exclude)},
     }  # fmt: skip
-    batch_at = frame_batches(video, model.config, seed=options.seed, exclude=options.exclude)
+    batch_at = frame_batches(video, model.config, seed=options.seed, exclude=options.exclude, moving=moving)
     result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata)
     return summarise(result, options.out, "finetune")
+
+
+def moving_pixels(model, video, exclude):
+    """(N, H, W) bool of what may move, by the frames' own analysis; None where the model has none."""
+    maps = novel_view.prepare(model.params, video, config=model.config, exclude=exclude).maps
+    if maps is None:
+        return None
+    size = video.images.shape[2:0:-1]
+    likely = np.asarray(jax.nn.sigmoid(maps.moving_logits), np.float32)
+    grown = [cv2.resize(cv2.dilate(frame, np.ones((3, 3))), size) for frame in likely]
+    return np.stack(grown) > MOVING

@@ -17,7 +17,7 @@ FRAMES_WEIGHTS = Terms(rec=20.0, b=1e-3)  # nothing is known of a real scene but
 HOLES, STEPS_PER_HOLES = 3, 8
 
 
-def frame_batches(video, config, *, seed, exclude=()):
+def frame_batches(video, config, *, seed, exclude=(), moving=None):
     """step -> batch: a hole of the step's group, predicted from the frames that are neither holes nor excluded.
 
     Args:
@@ -25,9 +25,10 @@ def frame_batches(video, config, *, seed, exclude=()):
       config: `presets.Config`.
       seed: draws the holes and the crops.
       exclude: frames that serve nothing, not even as targets.
+      moving: (N, H, W) bool of moving pixels, or None: nothing is known to move.
     """
     usable = np.array([i for i in range(len(video.images)) if i not in set(exclude)])
-    clip, seen = _clip(video), footage(video.images)
+    clip, seen = _clip(video, moving), footage(video.images)
 
     @functools.lru_cache(maxsize=16)
     def prepared(group):
@@ -50,13 +51,14 @@ def frame_batches(video, config, *, seed, exclude=()):
     return batch_at
 
 
-def _clip(video):
+def _clip(video, moving):
     """A `Clip` that knows nothing but the frames; what it does not know is weighted with nothing."""
     count, height, width = video.images.shape[:3]
     maps, none = np.zeros((count, height, width), np.float32), np.zeros((0, height, width), np.float32)
+    moving = maps > 0 if moving is None else moving
     images = np.round(np.asarray(video.images) * 255).astype(np.uint8)
     return Clip(
-        images=images, depth=maps + float(video.far), moving=maps > 0, intrinsics=np.asarray(video.cameras.intrinsics),
+        images=images, depth=maps + float(video.far), moving=moving, intrinsics=np.asarray(video.cameras.intrinsics),
         camera_from_world=np.asarray(video.cameras.camera_from_world), near=video.near, far=video.far,
         target_images=images[:0], target_depth=none, target_moving=none > 0,
         target_scene_flow=np.zeros((0, 2, height, width, 3), np.float16), target_static_images=images[:0],

@@ -12,7 +12,7 @@ from zestjax.apps.paths import camera_path
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import number
-from zestjax.apps.weights import open_weights
+from zestjax.apps.weights import open_weights, standing_still
 from zestjax.cameras import resized
 from zestjax.io.files import write_bytes
 from zestjax.io.inputs import check_target
@@ -36,6 +36,7 @@ class RenderOptions:
     budget_seconds: float | None = None
     format: str | None = None
     fps: float = 12.0
+    still: bool = False
     seed: int = 0
     quiet: bool = False
 
@@ -51,6 +52,7 @@ def render(options):
     """
     model, out = open_weights(options.weights, published=True), Path(options.out)
     scene = open_scene(options.scene, model.config, size=options.size, protocol=None, layout=options.format).scene
+    model = standing_still(model) if options.still else model
     path = camera_path(options.path, scene.video, count=options.frames)
     views, timing = render_path(model, scene, path, budget=options.budget_seconds, quiet=options.quiet)
     pictures = np.stack([np.clip(np.asarray(view.colour, np.float32), 0, 1) for view in views])

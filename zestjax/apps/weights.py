@@ -93,6 +93,14 @@ def open_weights(path=None, *, system=None, published=False):
     return Model(params, config, found, path, metadata)
 
 
+def standing_still(model):
+    """The `Model` for a scene in which nothing moves: neither the motion volume nor the dynamic field is compiled."""
+    if model.system == PUBLISHED:
+        return model
+    params = model.params._replace(motion=None, dynamic=None)
+    return model._replace(params=params, config=dataclasses.replace(model.config, dynamic=False, motion=False))
+
+
 def import_mvsnerf(path, out, *, statistics="batch"):
     """Write MVSNeRF's published weights as a file that `render` and `evaluate` take.
 

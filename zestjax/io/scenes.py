@@ -35,12 +35,9 @@ from zestjax.video import Video
 
 PROTOCOLS = ("held-out", "strict", "paper")
 
-LAYOUTS = {
-    "idr": (is_idr, read_idr),
-    "llff": (is_llff, read_llff),
-    "nsff": (is_nsff, read_nsff),
-    "nrnerf": (is_nrnerf, read_nrnerf),
-}
+LAYOUTS = dict(
+    idr=(is_idr, read_idr), llff=(is_llff, read_llff), nsff=(is_nsff, read_nsff), nrnerf=(is_nrnerf, read_nrnerf)
+)
 """By name: a function of the folder that recognises it, and one that reads it to a `zestjax.io.layouts.Record`."""
 
 
