@@ -19,6 +19,8 @@ from zestjax.learn import (
     MOVER_SHARE,
     RAY_TERMS,
     SCENE_TERMS,
+    Fault,
+    find_fault,
     frames_only,
     make_train_step,
     scene_terms,
@@ -267,3 +269,15 @@ def test_the_views_stage_holds_the_analysis():
 def test_a_stage_that_there_is_not_is_refused():
     with pytest.raises(ValueError, match="stage_weights: `stage` is 'half'"):
         stage_weights("half")
+
+
+def test_what_is_not_finite_of_a_step_is_named_by_loss_frame_and_parameter():
+    batch, params = stage.batch(MINI), stage.params_of(MINI)
+    sound = find_fault(params, batch, config=MINI)
+    assert sound == Fault((), (), int(batch.inputs.time))
+    colour = np.array(batch.truth.colour)
+    colour[0] = np.nan
+    fault = find_fault(params, batch._replace(truth=batch.truth._replace(colour=colour)), config=MINI)
+    assert "rec" in fault.terms and "flow3d" not in fault.terms
+    assert fault.frame == int(batch.inputs.time) and any("static" in leaf for leaf in fault.leaves)
+    assert "loss rec" in str(fault) and f"target frame {fault.frame}" in str(fault)

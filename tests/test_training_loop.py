@@ -17,6 +17,7 @@ from zestjax.apps.log import read_log
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.io.checkpoints import latest_checkpoint
 from zestjax.io.weights import WeightsError, load_weights
+from zestjax.solve import Adam
 from zestjax.training import TrainState, batch_key
 
 RUN = {"config": {"width": 3}, "seed": 7, "data": "toy"}
@@ -224,3 +225,19 @@ def test_the_producer_ends_with_its_trainer(source):
     process = source.producer.process
     process.stdin.close()
     assert process.wait(timeout=20) == 0
+
+
+def test_a_step_that_is_skipped_is_explained_and_the_run_goes_on(tmp_path, capsys):
+    solver = Adam(learning_rate=0.1)
+
+    def step(params, opt_state, batch):
+        params, opt_state = solver.apply(params, opt_state, {"w": params["w"] - batch}, jnp.float32(1))
+        return params, opt_state, {"total": jnp.float32(1)}
+
+    state = TrainState({"w": jnp.zeros(2)}, solver.init_state({"w": jnp.zeros(2)}), 0)
+    batch_at = lambda n: jnp.full(2, jnp.nan if n == 2 else 1.0, jnp.float32)
+    explain = lambda params, batch: f"not finite: batch {batch[0]}"
+    ended = run_loop(jax.jit(step), state, batch_at, options(tmp_path, 6), metadata=RUN, explain=explain)
+    assert int(ended.state.opt_state.skipped) == 1 and np.isfinite(ended.state.params["w"]).all()
+    assert json.loads((tmp_path / "faults.jsonl").read_text()) == {"step": 3, "fault": "not finite: batch nan"}
+    assert "warning: step 3 was skipped; not finite: batch nan" in capsys.readouterr().err

@@ -6,6 +6,7 @@ A step's gradient is summed over blocks of rays inside the loop, and the volumes
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -140,12 +141,54 @@ def train_step(config, *, weights=FRAME_WEIGHTS, solver):
       is the mean over the blocks of rays of each block's own. It raises `ValueError` if the rays cannot be shared
       evenly among `config.ray_blocks`. With `frames_only` weights there are no rays and a `FrameBatch` serves.
     """
+    gradients = step_gradients(config, weights=weights)
+
+    def step(params, opt_state, batch):
+        grads, terms, total = gradients(params, batch)
+        params, opt_state = solver.apply(params, opt_state, grads, total)
+        return params, opt_state, terms._asdict() | {"total": total}
+
+    return step
+
+
+class Fault(NamedTuple):
+    """What of a step is not finite. terms: names of losses. leaves: paths of parameters. frame: the target's time, or
+    None of a step that has no target."""
+
+    terms: tuple[str, ...]
+    leaves: tuple[str, ...]
+    frame: int | None
+
+    def __str__(self):
+        some = lambda names: ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        lost = f"loss {some(self.terms)}" if self.terms else "no loss"
+        where = "" if self.frame is None else f", target frame {self.frame}"
+        return f"not finite: {lost}{where}; gradient of {some(self.leaves) if self.leaves else 'no parameter'}"
+
+
+def find_fault(params, batch, *, config, weights=FRAME_WEIGHTS):
+    """`Fault` of a step's losses and gradients; compiled when it is asked for, at the cost of one step."""
+
+    @jax.jit
+    def finite(params, batch):
+        grads, terms, _ = step_gradients(config, weights=weights)(params, batch)
+        return jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), (grads, terms._asdict()))
+
+    grads, terms = finite(params, batch)
+    named = jax.tree_util.tree_leaves_with_path(grads)
+    leaves = tuple(jax.tree_util.keystr(path) for path, good in named if not good)
+    lost = tuple(name for name, good in terms.items() if good is not None and not good)
+    return Fault(lost, leaves, int(batch.inputs.time) if hasattr(batch, "inputs") else None)
+
+
+def step_gradients(config, *, weights=FRAME_WEIGHTS):
+    """`gradients(params, batch) -> (gradients, `Terms`, their weighted sum)` of `train_step`, see there."""
     if frames_only(weights):
-        return _frames_step(weights, solver)
+        return _frames_gradients(weights)
     of_rays = _only(weights, RAY_TERMS if config.dynamic else ("rec",))
     rays = functools.partial(_rays, config=config, weights=of_rays)
 
-    def step(params, opt_state, batch):
+    def gradients(params, batch):
         scene = lambda p: _scene(p, batch, config=config, weights=weights)
         (encoded, _), pull, (maps, terms) = jax.vjp(scene, params, has_aux=True)
         encoding = jax.lax.stop_gradient(assemble(batch.inputs, maps, encoded, config=config))
@@ -161,16 +204,15 @@ def train_step(config, *, weights=FRAME_WEIGHTS, solver):
         grads = jax.tree.map(jnp.add, towards_params, through)
         terms = Terms(*(a if a is not None else b for a, b in zip(terms, found, strict=True)))
         total = weighted_sum(terms, Terms(*(w if t is not None else None for t, w in zip(terms, weights, strict=True))))
-        params, opt_state = solver.apply(params, opt_state, grads, total)
-        return params, opt_state, terms._asdict() | {"total": total}
+        return grads, terms, total
 
-    return step
+    return gradients
 
 
-def _frames_step(weights, solver):
-    """`train_step` of the frames' own terms alone."""
+def _frames_gradients(weights):
+    """`step_gradients` of the frames' own terms alone."""
 
-    def step(params, opt_state, batch):
+    def gradients(params, batch):
         def loss(analysis):
             maps = frame_maps(analysis, dequantised(batch.evidence))
             terms = scene_terms(maps, (None, None), batch, weights)
@@ -178,10 +220,9 @@ def _frames_step(weights, solver):
 
         (total, terms), towards = jax.value_and_grad(loss, has_aux=True)(params.analysis)
         grads = jax.tree.map(jnp.zeros_like, params)._replace(analysis=towards)
-        params, opt_state = solver.apply(params, opt_state, grads, total)
-        return params, opt_state, terms._asdict() | {"total": total}
+        return grads, terms, total
 
-    return step
+    return gradients
 
 
 def _scene(params, batch, *, config, weights):

@@ -5,6 +5,7 @@ moves would learn to fade. It is therefore left out, as far as the frames' own a
 """
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,7 @@ from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.train import summarise
 from zestjax.apps.weights import open_weights
-from zestjax.learn import make_train_step
+from zestjax.learn import find_fault, make_train_step
 from zestjax.losses.objective import Terms
 from zestjax.training import TrainState
 
@@ -64,6 +65,7 @@ def finetune(options):
     moving = moving_pixels(model, video, options.exclude)
     weights = FRAMES_WEIGHTS if moving is None else STILL_WEIGHTS
     init, step_fn = make_train_step(model.config, steps=FOREVER, weights=weights, peak=RATE, floor=RATE, warmup=5)
+    explain = functools.partial(find_fault, config=model.config, weights=weights)
     params = jax.tree.map(jnp.array, model.params)  # copies: the step donates
     loop = LoopOptions(options.out, options.steps, options.budget, options.resume, 60.0, quiet=options.quiet)
     metadata = model.metadata | {
@@ -71,7 +73,7 @@ def finetune(options):
         "data": {"scene": str(options.scene), "exclude": list(options.exclude)},
     }  # fmt: skip
     batch_at = frame_batches(video, model.config, seed=options.seed, exclude=options.exclude, moving=moving)
-    result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata)
+    result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "finetune")
 
 

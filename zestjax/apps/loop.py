@@ -6,6 +6,7 @@ and `weights.safetensors`. A checkpoint is a whole `TrainState`; the log is cut 
 
 import contextlib
 import dataclasses
+import json
 import signal
 import sys
 import time
@@ -18,6 +19,8 @@ from zestjax.apps.log import Recorder, cut_log
 from zestjax.io.checkpoints import latest_checkpoint, save_checkpoint
 from zestjax.io.weights import WeightsError, save_weights
 from zestjax.training import TrainState, training_steps
+
+MOST_FAULTS = 5  # explained in one call: each costs as much as a step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +51,7 @@ class LoopResult(NamedTuple):
     finished: bool
 
 
-def run_loop(step_fn, start, batch_at, options, *, metadata):
+def run_loop(step_fn, start, batch_at, options, *, metadata, explain=None):
     """Train until the steps, the seconds or a signal ends it; every file is complete whenever the process dies.
 
     Args:
@@ -56,6 +59,7 @@ def run_loop(step_fn, start, batch_at, options, *, metadata):
       start: fresh `TrainState`; also the template that a checkpoint is read into.
       batch_at: step -> batch, a pure function of the step.
       options: `LoopOptions`.
+      explain: (params, batch) -> what to say of a step that the solver skipped, or None.
       metadata: dict stored with every checkpoint and the weights: the full configuration and the run's seed.
 
     Returns:
@@ -72,10 +76,11 @@ def run_loop(step_fn, start, batch_at, options, *, metadata):
     recorder = Recorder(out / "log.jsonl", options.log_steps)
     save = lambda state, seconds: _save(out, state, metadata, seconds)
     with _StopOnSignal() as stop, _bar(start.step, options) as bar:
-        state, clock = start, _Clock(seconds, options)
+        state, clock, faults = start, _Clock(seconds, options), _Faults(out, start, explain)
         for state, info in training_steps(step_fn, start, batch_at, steps=options.steps):
             clock.tick()
             recorder.add(state.step, info, clock)
+            faults.see(state, batch_at)
             _show(bar, recorder, clock)
             done = stop.asked or clock.over() or state.step == options.steps
             if done or clock.checkpoint_due():
@@ -124,6 +129,27 @@ def _save(out, state, metadata, seconds):
         state.params,
         metadata=metadata | {"step": state.step, "seconds": round(seconds, 1)},
     )
+
+
+class _Faults:
+    """Reports a step that the solver skipped: what was not finite, on standard error and in `faults.jsonl`."""
+
+    def __init__(self, out, start, explain):
+        self.path, self.explain, self.left = out / "faults.jsonl", explain, MOST_FAULTS
+        self.count = int(getattr(start.opt_state, "skipped", 0))
+
+    def see(self, state, batch_at):
+        count = int(getattr(state.opt_state, "skipped", 0))
+        if count == self.count:
+            return
+        self.count = count
+        if self.explain is None or self.left == 0:
+            return
+        self.left -= 1
+        said = str(self.explain(state.params, batch_at(state.step - 1)))
+        tqdm.write(f"warning: step {state.step} was skipped; {said}", file=sys.stderr)
+        with self.path.open("a") as file:
+            file.write(json.dumps({"step": state.step, "fault": said}) + "\n")
 
 
 class _Clock:

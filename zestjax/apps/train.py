@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, fra
 from zestjax.checks import check_option
 from zestjax.evidence import Evidence
 from zestjax.io.weights import load_weights
-from zestjax.learn import FRAME_WEIGHTS, STAGES, make_train_step, stage_weights
+from zestjax.learn import FRAME_WEIGHTS, STAGES, find_fault, make_train_step, stage_weights
 from zestjax.model import init_params
 from zestjax.presets import preset as preset_of
 from zestjax.training import TrainState, batch_key, clip_index, clip_window
@@ -90,8 +91,9 @@ def train(options):
     loop = LoopOptions(
         options.out, options.steps, limit, options.resume, 60 * options.checkpoint_minutes, quiet=options.quiet
     )
+    explain = functools.partial(find_fault, config=config, weights=run_weights(options))
     with batches(config, options) as batch_at:
-        result = run_loop(step_fn, state, batch_at, loop, metadata=metadata)
+        result = run_loop(step_fn, state, batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "train")
 
 
@@ -104,11 +106,15 @@ def fresh(config, options):
     if options.analysis is not None:
         other: Any = load_weights(options.analysis, like=params)[0]
         params = params._replace(analysis=other.analysis)
-    weights = stage_weights(options.stage, weights=FRAMES_WEIGHTS if options.scenes else FRAME_WEIGHTS)
     init, step_fn = make_train_step(
-        config, steps=options.steps, weights=weights, peak=options.peak, floor=options.peak / 100
+        config, steps=options.steps, weights=run_weights(options), peak=options.peak, floor=options.peak / 100
     )
     return TrainState(params, init(params), 0), step_fn
+
+
+def run_weights(options):
+    """`Terms` that a run learns from: those of its stage, of what is known of its scenes."""
+    return stage_weights(options.stage, weights=FRAMES_WEIGHTS if options.scenes else FRAME_WEIGHTS)
 
 
 def run_metadata(config, options):
