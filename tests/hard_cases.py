@@ -157,7 +157,7 @@ CASES = [
     Case("air before a last interval of 1e10", "the sum absorbs all before it", weights,
          (array(1e-3, 1e-3, 1e-3, 1e-3), LAST)),
     Case("thin air", "1 - exp(-x) rounds to 0", opacities, (np.full(4, 1e-9, np.float32),),
-         np.full(4, 1e-9), 1e-3),
+         np.full(4, 1e-9), 1e-3, unit=1e-12),
     Case("b at 0", "the logarithm of b", blended, (draw(1, 4), draw(2, 4), EMPTY)),
     Case("b at 1", "the logarithm of 1 - b", blended, (draw(1, 4), draw(2, 4), ONES)),
     Case("opaque in both fields", "a product of zeros has no gradient by division", blended, (ONES, ONES, 0.5 * ONES)),
