@@ -111,3 +111,10 @@ def test_wrong_arguments_are_refused():
         resample.bilinear(jnp.ones((2, 2)), jnp.ones(2))
     with pytest.raises(ValueError, match="`cells`"):
         resample.trilinear(jnp.ones((2, 2, 2, 1)), jnp.ones(2))
+
+
+def test_no_address_leaves_the_axis_whatever_the_coordinate():
+    lower, fraction = resample.split(jnp.array([-0.5, -jnp.inf, jnp.nan, 3.25, 9.0, jnp.inf]), 5)
+    np.testing.assert_array_equal(lower, [0, 0, 0, 3, 3, 3])
+    np.testing.assert_array_equal(fraction[jnp.array([0, 3, 4])], [-0.5, 0.25, 6])
+    assert jnp.isnan(fraction[2])
