@@ -60,7 +60,6 @@ MUTATIONS = {
         ("return jnp.where(inside[..., None], values, 0) if border == \"zero\" else values", "return values"),
     ],
     "trust": [
-        ("return -jnp.expm1(-gap * gap)", "return jnp.zeros_like(gap)"),
         ("tolerance = jnp.maximum(tolerance, NARROWEST)", "tolerance = tolerance"),
         ("return jnp.where(far, FARTHEST, distance / jnp.where(far, 1, tolerance))", "return distance / tolerance"),
     ],

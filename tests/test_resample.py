@@ -118,3 +118,11 @@ def test_no_address_leaves_the_axis_whatever_the_coordinate():
     np.testing.assert_array_equal(lower, [0, 0, 0, 3, 3, 3])
     np.testing.assert_array_equal(fraction[jnp.array([0, 3, 4])], [-0.5, 0.25, 6])
     assert jnp.isnan(fraction[2])
+
+
+@pytest.mark.parametrize("far", [np.nan, np.inf, -np.inf, 1e30])
+def test_cells_that_are_not_numbers_are_outside_a_volume(far):
+    cells, volume = jnp.asarray([[far, 1.0, 1.0], [1.0, 1.0, far], [1.0, 1.0, 1.0]]), jnp.ones((2, 3, 4, 1))
+    read = lambda cells: resample.trilinear(volume, cells, border="zero")
+    np.testing.assert_array_equal(read(cells)[:, 0], [0, 0, 1])
+    assert np.isfinite(jax.grad(lambda c: read(c).sum())(cells)).all()

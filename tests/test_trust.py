@@ -25,7 +25,6 @@ def test_trust_is_the_printed_formula():
 
 def test_a_point_on_or_in_front_of_the_surface_is_not_hidden():
     point = jnp.asarray([0.5, 0.7, 9.0])
-    np.testing.assert_array_equal(trust.behind(jnp.full(3, 0.5), jnp.full(3, 0.1), point), 0)
     np.testing.assert_array_equal(
         trust.trusted(jnp.full(3, 0.8), jnp.full(3, 0.5), jnp.full(3, 0.1), point), np.float32(0.8)
     )

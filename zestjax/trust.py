@@ -36,15 +36,6 @@ def agreement(inverse_depth, tolerance, point_inverse_depth):
     return jnp.exp(-gap * gap)
 
 
-def behind(inverse_depth, tolerance, point_inverse_depth):
-    """How surely the frame's surface hides the point, in [0, 1]; 0 for a point on the surface or in front of it.
-
-    1 - exp(-(relu(inverse_depth - point) / tolerance)^2).
-    """
-    gap = _gap(jax.nn.relu(inverse_depth - point_inverse_depth), tolerance)
-    return -jnp.expm1(-gap * gap)
-
-
 def trusted(static, inverse_depth, tolerance, point_inverse_depth):
     """Weight in [0, 1] of a source at a point: static and not hidden.
 

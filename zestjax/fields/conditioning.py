@@ -75,7 +75,7 @@ def sample_views(views, points):
 
 
 def hidden(gap):
-    """Soft probability that a point at `gap` is hidden behind a view's surface, in [0, 1]; `trust.behind` of a gap."""
+    """Soft probability that a point at `gap` is hidden behind a view's surface, in [0, 1]."""
     return -jnp.expm1(-jnp.square(jnp.maximum(gap, 0)))
 
 
