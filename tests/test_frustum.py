@@ -93,3 +93,11 @@ def test_wrong_arguments_are_refused():
         frustum.frustum_from_world(scene(), jnp.ones(3), spacing="disparity")
     with pytest.raises(ValueError, match="`coords`"):
         frustum.world_from_frustum(scene(), jnp.ones(2))
+
+
+@pytest.mark.parametrize("z", [1.125, 1.4, 50.0])
+def test_beyond_infinity_is_held_at_a_thousand_times_far(z):
+    camera = Camera(jnp.asarray([[10.0, 0, 0], [0, 10, 0], [0, 0, 1]]), jnp.eye(4))
+    place = Frustum(camera, jnp.float32(1), jnp.float32(9), 5, 5)
+    point = frustum.world_from_frustum(place, jnp.asarray([0.0, 0.0, z]), spacing="inverse")
+    np.testing.assert_allclose(point[2], 9000, rtol=1e-4)

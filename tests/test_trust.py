@@ -78,3 +78,9 @@ def test_points_of_any_leading_shape():
     assert trusted_at(maps, camera, points).shape == (2, 5)
     with pytest.raises(ValueError, match="trusted_at"):
         trust.trusted_at(maps, camera, jnp.ones(2))
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 1e-30, 1e-3])
+def test_a_gap_too_large_for_a_float_still_has_a_finite_pull(tolerance):
+    fn = lambda surface: trust.agreement(surface, jnp.full_like(surface, tolerance), jnp.zeros_like(surface))
+    assert_finite(fn, jnp.asarray([1e30, 3e38], jnp.float32))
