@@ -15,6 +15,7 @@ from zestjax.fields.trunk import ColourHead, Trunk, direct_colour, trunk
 from zestjax.losses import photometric, priors, regularisers, scene_flow
 from zestjax.nets.layers import Dense, dense
 from zestjax.nets.positional import positional_encoding
+from zestjax.planesweep import sweep_grid
 
 TABLE = [
     [cell.strip() for cell in line.strip("|\n ").split("|")]
@@ -151,8 +152,6 @@ def volumes(take):
     ours = cost_volume.mvsnerf_cost_volume(
         features, cost_volume.quarter_colours(images), warps, padding=4, colour_views=3
     )
-    from zestjax.planesweep import sweep_grid
-
     sound = cost_volume.cost_volume(features, warps, sweep_grid(8, 8, padding=4)).variance
     mixed = jnp.concatenate([ours[..., :9], sound], -1)
     return {"cv_cost": (jnp.moveaxis(ours, -1, 0), jnp.moveaxis(mixed, -1, 0))}

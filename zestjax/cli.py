@@ -148,26 +148,29 @@ def _frontier(commands):
     command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: four)")
 
 
+def _import_command(commands, name, about, run):
+    """A command that turns others' weights into one file."""
+    command = commands.add_parser(name, help=about, description=about)
+    command.add_argument("--out", type=Path, required=True, metavar="WEIGHTS", help="file to write (.safetensors)")
+    command.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    command.set_defaults(run=run)
+    return command
+
+
 def _import_mvsnerf(commands):
     about = "MVSNeRF's published weights as a file for render and evaluate"
-    command = commands.add_parser("import-mvsnerf", help=about, description=about)
+    command = _import_command(commands, "import-mvsnerf", about, _run_import_mvsnerf)
     command.add_argument("file", type=Path, metavar="FILE", help="the released checkpoint, or an npz of its arrays")
-    command.add_argument("--out", type=Path, required=True, metavar="WEIGHTS", help="file to write (.safetensors)")
     command.add_argument(
         "--statistics", default="batch", help="of the norms: batch (as published, the default) or stored"
     )
-    command.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    command.set_defaults(run=_run_import_mvsnerf)
 
 
 def _import_lpips(commands):
     about = "torchvision's AlexNet and LPIPS's linear heads as a file for evaluate --lpips"
-    command = commands.add_parser("import-lpips", help=about, description=about)
+    command = _import_command(commands, "import-lpips", about, _run_import_lpips)
     command.add_argument("alexnet", type=Path, metavar="ALEXNET", help="torchvision's file, or an npz of its arrays")
     command.add_argument("heads", type=Path, metavar="HEADS", help="the authors' alex.pth (v0.1), or an npz")
-    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="file to write (.safetensors)")
-    command.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    command.set_defaults(run=_run_import_lpips)
 
 
 def _scene_flags(command):

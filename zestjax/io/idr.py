@@ -11,12 +11,11 @@ import cv2
 import numpy as np
 
 from zestjax.cameras import Camera
-from zestjax.io.layouts import Record, pictures_in
+from zestjax.io.layouts import Record, every_eighth, pictures_in
 from zestjax.io.pictures import image_size
 
 FILES = ("cameras_sphere.npz", "cameras.npz")
 DTU_COUNT, DTU_RESERVED = 49, (23, 24, 32, 44)
-EVERY = 8
 NATIVE = (1200, 1600)
 
 
@@ -47,7 +46,7 @@ def read_idr(path):
     cameras = Camera._make(map(np.stack, zip(*map(_camera, world.astype(np.float64)), strict=True)))
     near, far = _bounds(source, cameras, sphere.astype(np.float64))
     count = len(images)
-    reserved = DTU_RESERVED if count == DTU_COUNT else tuple(range(0, count, EVERY))
+    reserved = DTU_RESERVED if count == DTU_COUNT else every_eighth(count)
     name = path.resolve().name
     return Record(name, "idr", images, cameras, _native(cameras, images), near, far, reserved=reserved)
 

@@ -78,6 +78,11 @@ def bounds_from_frames(bounds):
     return 0.9 * float(np.percentile(bounds[:, 0], 5)), float(np.percentile(bounds[:, 1], 95)) / 0.9
 
 
+def every_eighth(count):
+    """The frames that LLFF's convention holds out of `count` photographs."""
+    return tuple(range(0, count, 8))
+
+
 def pictures_in(folder):
     """Picture files of a folder (not of folders in it), sorted by name; empty when there is no such folder."""
     if not folder.is_dir():

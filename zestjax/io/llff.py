@@ -6,9 +6,9 @@ of the folders in which NSFF keeps what it knows of a video. Every eighth photog
 
 import dataclasses
 
+from zestjax.io.layouts import every_eighth
 from zestjax.io.nsff import is_nsff, read_nsff
 
-EVERY = 8
 OF_A_VIDEO = ("dense", "mv_images", "motion_masks", "disp", "flow_i1", "truth", "scene.json")
 
 
@@ -21,4 +21,4 @@ def is_llff(path):
 def read_llff(path):
     """Read the folder to a `Record`; raises as `nsff.read_nsff`."""
     record = read_nsff(path)
-    return dataclasses.replace(record, layout="llff", reserved=tuple(range(0, len(record.images), EVERY)))
+    return dataclasses.replace(record, layout="llff", reserved=every_eighth(len(record.images)))

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from zestjax.io.torch_files import read_torch
+from zestjax.io.torch_files import read_named_arrays
 from zestjax.io.weights import WeightsError, load_weights, save_weights
 from zestjax.lpips import LpipsParams, lpips_like
 from zestjax.nets.layers import Conv
@@ -26,7 +25,7 @@ def read_lpips(alexnet, heads):
     Raises:
       WeightsError: a file that cannot be read, or lacks an array, or has one of another shape.
     """
-    body, linear = _arrays(alexnet), _arrays(heads)
+    body, linear = read_named_arrays(alexnet), read_named_arrays(heads)
     try:
         kernels = [body[f"features.{i}.weight"].transpose(2, 3, 1, 0) for i in FEATURES]
         biases = [body[f"features.{i}.bias"] for i in FEATURES]
@@ -66,19 +65,3 @@ def load_lpips(path):
 
 def _float(array):
     return jnp.asarray(array, jnp.float32)
-
-
-def _arrays(path):
-    path = Path(path)
-    try:
-        if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as stored:
-                return dict(stored)
-        found = read_torch(path)
-    except OSError as error:
-        raise WeightsError(f"{path}: could not be read ({error.strerror or error}); check the path.") from error
-    except ValueError as error:
-        raise WeightsError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-    if not isinstance(found, dict):
-        raise WeightsError(f"{path}: holds no arrays by name; {REMEDY}")
-    return found

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from zestjax.checks import check_option
 from zestjax.fields.trunk import ColourHead, Trunk
-from zestjax.io.torch_files import read_torch
+from zestjax.io.torch_files import read_named_arrays
 from zestjax.io.weights import WeightsError
 from zestjax.mvsnerf import MvsNerfField, MvsNerfParams, init_mvsnerf
 from zestjax.nets.cost_regulariser import CostRegulariser
@@ -35,13 +34,7 @@ def read_mvsnerf(path, *, statistics="batch"):
       WeightsError: no such file, not one of these, or arrays missing or of other shapes.
     """
     check_option("read_mvsnerf", statistics=(statistics, STATISTICS))
-    path = Path(path)
-    try:
-        arrays = _arrays(path)
-    except OSError as error:
-        raise WeightsError(f"{path}: could not be read ({error.strerror or error}); check the path.") from error
-    except ValueError as error:
-        raise WeightsError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    arrays = _published(path)
     try:
         params = mvsnerf_params(arrays, statistics=statistics)
     except (KeyError, ValueError, TypeError) as error:
@@ -66,13 +59,13 @@ def mvsnerf_like(*, statistics="batch"):
     return jax.tree.map(norm, like, is_leaf=lambda x: isinstance(x, Norm))
 
 
-def _arrays(path):
-    if path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as stored:
-            return dict(stored)
-    saved = read_torch(path)
-    if not isinstance(saved, dict) or not set(PARTS.values()) <= set(saved):
-        raise ValueError(f"holds no {' and '.join(PARTS.values())}; {REMEDY}")
+def _published(path):
+    """Arrays by published name."""
+    saved = read_named_arrays(path)
+    if Path(path).suffix == ".npz":
+        return saved
+    if not set(PARTS.values()) <= set(saved):
+        raise WeightsError(f"{path}: holds no {' and '.join(PARTS.values())}; {REMEDY}")
     return {f"{part}/{name}": array for part, key in PARTS.items() for name, array in saved[key].items()}
 
 

@@ -16,6 +16,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.io.weights import WeightsError
+
 STORAGES = {
     "FloatStorage": np.dtype("<f4"), "DoubleStorage": np.dtype("<f8"), "HalfStorage": np.dtype("<f2"),
     "LongStorage": np.dtype("<i8"), "IntStorage": np.dtype("<i4"), "ShortStorage": np.dtype("<i2"),
@@ -56,6 +58,27 @@ def read_torch(path):
         raise TorchFileError(
             f"{path}: is not a PyTorch file, or a damaged one ({type(error).__name__}: {error}); download it again."
         ) from error
+
+
+def read_named_arrays(path):
+    """A dict of a PyTorch file, or of an npz, which is how such a file's arrays are handed on without PyTorch.
+
+    Raises:
+      WeightsError: the file cannot be read, is damaged, or holds no dict.
+    """
+    path = Path(path)
+    try:
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as stored:
+                return dict(stored)
+        found = read_torch(path)
+    except OSError as error:
+        raise WeightsError(f"{path}: could not be read ({error.strerror or error}); check the path.") from error
+    except (ValueError, zipfile.BadZipFile) as error:
+        raise WeightsError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    if not isinstance(found, dict):
+        raise WeightsError(f"{path}: holds no arrays by name; save a state_dict.")
+    return found
 
 
 def _read_zip(content):
