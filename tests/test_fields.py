@@ -77,10 +77,13 @@ def test_the_gap_says_how_far_a_views_surface_lies_in_front():
     points = unproject(camera, jnp.full((5, 2), 4.0), depth)
     gap = sample_views(views_of(maps), points[None]).gap[0]
     np.testing.assert_allclose(gap, [0, 1, -1, 3, -3], atol=1e-5)
+    np.testing.assert_allclose(conditioning.on_surface(gap), np.exp(-np.square([0.0, 1, -1, 3, -3])), atol=1e-5)
+    np.testing.assert_allclose(conditioning.hidden(gap), 1 - np.exp(-np.square([0.0, 1, 0, 3, 0])), atol=1e-5)
     inverse, tolerance = jnp.full(5, 0.5), jnp.full(5, 0.1)
-    near = np.abs((0.5 - 1 / np.asarray(depth)) / 0.1) < 3
-    for ours, theirs in ((conditioning.hidden, trust.behind), (conditioning.on_surface, trust.agreement)):
-        np.testing.assert_allclose(ours(gap)[near], theirs(inverse, tolerance, 1 / depth)[near], atol=1e-5)
+    near = np.abs((0.5 - 1 / np.asarray(depth)) / 0.1) < 3  # where the gap is not clipped, the two forms are one
+    np.testing.assert_allclose(
+        conditioning.on_surface(gap)[near], trust.agreement(inverse, tolerance, 1 / depth)[near], atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e9])
