@@ -13,7 +13,7 @@ LAYERS = [
     "cameras video rays resample frustum",
     "nets planesweep plane_statistics selection trust cost_volume optical_flow evidence analysis encoding",
     "fields",
-    "rendering depth flow presets model prediction assembly",
+    "rendering depth flow precision presets model prediction assembly",
     "losses",
     "adam schedules solve",
     "metrics lpips io simulate floors testing measures batches novel_view mvsnerf learn training",

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax.evidence import FLOW_CHANNELS
+from zestjax.nets.layers import raised
 from zestjax.nets.unet2d import UNet2d, init_unet2d, unet2d
 
 STILL_COSTS, MOVING_COSTS = 6, 2  # static, best and still; moving; and each averaged over its surroundings
@@ -127,7 +128,7 @@ def frame_maps(params, evidence, *, still=False):
 
     Source: zestjax: a coarse depth and a motion mask for every input frame.
     """
-    evidence = jax.tree.map(lambda x: x.astype(jnp.float32), evidence)
+    evidence = jax.tree.map(raised, evidence)
     costs = jax.lax.stop_gradient(_costs(evidence))
     planes = costs.shape[-1]
     ground, standing = jax.lax.stop_gradient(_ground(costs))

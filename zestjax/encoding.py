@@ -17,7 +17,7 @@ from zestjax.checks import check_shapes
 from zestjax.cost_volume import cost_volume
 from zestjax.nets.cost_regulariser import CostRegulariser, cost_regulariser, init_cost_regulariser
 from zestjax.nets.feature_pyramid import FeaturePyramid, init_feature_pyramid
-from zestjax.nets.layers import Dense, dense, init_dense
+from zestjax.nets.layers import Dense, dense, init_dense, raised
 from zestjax.planesweep import carry, homographies, sweep_grid
 from zestjax.trust import Trust, agreement
 
@@ -174,5 +174,5 @@ def encode_volume(params, views, camera, size, depths, *, colours, trusted, slot
     cells = cost_regulariser(params.regulariser, jnp.concatenate(channels, axis=-1))
     if params.occupied is None:
         return Volume(cells, None)
-    logits = dense(params.occupied, cells)[..., 0] + vote
+    logits = raised(dense(params.occupied, cells))[..., 0] + vote
     return Volume(jnp.concatenate([cells, jax.nn.softmax(logits, axis=0)[..., None]], axis=-1), logits)

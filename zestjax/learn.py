@@ -20,6 +20,7 @@ from zestjax.losses.objective import Terms, absent, measured, weighted_sum
 from zestjax.losses.supervision import depth_cross_entropy_loss
 from zestjax.measures import make_measures
 from zestjax.model import Encoding, assemble, reference_frustum, volumes
+from zestjax.precision import geometry_at, network_at
 from zestjax.prediction import render_rays
 from zestjax.schedules import cosine
 from zestjax.solve import Adam
@@ -184,11 +185,12 @@ def find_fault(params, batch, *, config, weights=FRAME_WEIGHTS):
 def step_gradients(config, *, weights=FRAME_WEIGHTS):
     """`gradients(params, batch) -> (gradients, `Terms`, their weighted sum)` of `train_step`, see there."""
     if frames_only(weights):
-        return _frames_gradients(weights)
+        return _frames_gradients(config, weights)
     of_rays = _only(weights, RAY_TERMS if config.dynamic else ("rec",))
     rays = functools.partial(_rays, config=config, weights=of_rays)
 
     def gradients(params, batch):
+        batch = geometry_at(config.precision, batch)
         scene = lambda p: _scene(p, batch, config=config, weights=weights)
         (encoded, _), pull, (maps, terms) = jax.vjp(scene, params, has_aux=True)
         encoding = jax.lax.stop_gradient(assemble(batch.inputs, maps, encoded, config=config))
@@ -209,12 +211,12 @@ def step_gradients(config, *, weights=FRAME_WEIGHTS):
     return gradients
 
 
-def _frames_gradients(weights):
+def _frames_gradients(config, weights):
     """`step_gradients` of the frames' own terms alone."""
 
     def gradients(params, batch):
         def loss(analysis):
-            maps = frame_maps(analysis, dequantised(batch.evidence))
+            maps = _analysed(analysis, batch, config)
             terms = scene_terms(maps, (None, None), batch, weights)
             return weighted_sum(terms, weights), terms
 
@@ -225,14 +227,20 @@ def _frames_gradients(weights):
     return gradients
 
 
+def _analysed(params, batch, config):
+    """`FrameMaps` of a batch's frames."""
+    evidence = geometry_at(config.precision, dequantised(batch.evidence))
+    return frame_maps(network_at(config.precision, params), evidence)
+
+
 def _scene(params, batch, *, config, weights):
     """((volumes, weighted loss of what needs no ray), (maps, its terms))."""
     maps = None
     if params.analysis is not None:
         held = config.hold_trust and not config.features and all(absent(getattr(weights, n)) for n in FRAME_TERMS)
         analysis = jax.lax.stop_gradient(params.analysis) if held else params.analysis
-        maps = frame_maps(analysis, dequantised(batch.evidence))
-    encoded = volumes(params, batch.inputs, maps, config=config)
+        maps = _analysed(analysis, batch, config)
+    encoded = volumes(network_at(config.precision, params), batch.inputs, maps, config=config)
     guided = all(v is None or v.logits is not None for v in encoded)
     known = [n for n in SCENE_TERMS if (n == "depth_ce" and guided) or (n != "depth_ce" and maps is not None)]
     terms = scene_terms(maps, encoded, batch, _only(weights, known))
@@ -242,6 +250,7 @@ def _scene(params, batch, *, config, weights):
 def _rays(params, encoded, tables, inputs, truth, *, config, weights):
     """(weighted loss of a block of rays, its terms)."""
     (geometry, motion), (key, slots, guides) = encoded, tables
+    params = network_at(config.precision, params)
     encoding = Encoding(geometry, motion, key, slots, reference_frustum(inputs, config), guides)
     prediction = render_rays(params, encoding, inputs, truth.pixels, config=config)
     terms = measured(make_measures(params, encoding, inputs, config=config), prediction, truth, weights)

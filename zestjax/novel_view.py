@@ -17,6 +17,7 @@ from zestjax.assembly import Footage, dequantised, footage, target_inputs, video
 from zestjax.cameras import project
 from zestjax.frustum import world_from_frustum
 from zestjax.model import encode
+from zestjax.precision import geometry_at, network_at
 from zestjax.prediction import render_rays
 from zestjax.rays import pixel_grid
 from zestjax.video import Video
@@ -47,9 +48,10 @@ class View(NamedTuple):
     flow: jax.Array | None
 
 
-@functools.partial(jax.jit, static_argnames="still")
-def _maps(params, evidence, *, still):
-    return frame_maps(params, dequantised(evidence), still=still)
+@functools.partial(jax.jit, static_argnames=("still", "precision"))
+def _maps(params, evidence, *, still, precision):
+    evidence = geometry_at(precision, dequantised(evidence))
+    return frame_maps(network_at(precision, params), evidence, still=still)
 
 
 def _frame_maps(params, seen, video, config, *, frames=None, exclude=()):
@@ -59,7 +61,7 @@ def _frame_maps(params, seen, video, config, *, frames=None, exclude=()):
         seen, video.cameras, video.near, video.far, planes=config.evidence_planes, frames=used, exclude=exclude
     )
     evidence = evidence if place is None else jax.tree.map(lambda x: x[place], evidence)
-    return _maps(params.analysis, evidence, still=not config.dynamic)
+    return _maps(params.analysis, evidence, still=not config.dynamic, precision=config.precision)
 
 
 def prepare(params, video, *, config, exclude=()):
@@ -121,12 +123,14 @@ def render_inputs(params, inputs, maps, *, config, rows=None):
     Returns:
       `View`.
     """
+    params = network_at(config.precision, params)
+    inputs, maps = geometry_at(config.precision, (inputs, maps))
     encoding = encode(params, inputs, maps, config=config)
     height, width = inputs.key.images.shape[1:3]
     height = height if rows is None else rows
     together = min(BLOCK_ROWS, height)
     blocks = -(-height // together)
-    pixels = pixel_grid(blocks * together, width).reshape(blocks, -1, 2)
+    pixels = pixel_grid(blocks * together, width, dtype=inputs.key.images.dtype).reshape(blocks, -1, 2)
     block = lambda p: _view_block(render_rays(params, encoding, inputs, p, config=config), encoding, inputs, p, config)
     image = lambda x: x.reshape(blocks * together, width, *x.shape[2:])[:height]
     view = jax.tree.map(image, jax.lax.map(block, pixels))

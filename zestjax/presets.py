@@ -7,6 +7,7 @@
 import dataclasses
 
 from zestjax.checks import check_option
+from zestjax.precision import PRECISIONS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Config:
     rays: of a training step, whole `rows` (crop_rows of them) or as many pixels drawn `uniform`ly, and mined_rays more
       from what moves. ray_blocks: parts in which they are computed.
     head: `blend` of the views' colours or `direct`. blend: `opacity` or `density` form of the two fields' sum.
+    precision: see `precision`: of the networks; geometry beside `bfloat16` networks stays float32.
     """
 
     name: str
@@ -60,6 +62,7 @@ class Config:
     mined_rays: int = 0
     crop_rows: int = 16
     ray_blocks: int = 4
+    precision: str = "float32"
 
     def __post_init__(self):
         check_option(
@@ -73,6 +76,7 @@ class Config:
             head=(self.head, ("blend", "direct")),
             conditioning=(self.conditioning, ("pooled", "concatenated")),
             blend=(self.blend, ("opacity", "density")),
+            precision=(self.precision, PRECISIONS),
         )
         self._check_together()
 

@@ -26,7 +26,7 @@ from zestjax.fields.trunk import (
     trunk,
     view_scores,
 )
-from zestjax.nets.layers import Dense, dense, init_dense
+from zestjax.nets.layers import Dense, dense, init_dense, raised
 
 VIEW_FEATURES = 14
 POOLED = 16
@@ -82,7 +82,7 @@ def early_flow(params, point, volume, *, reach):
     """
     first, second = params.motion
     state = jax.nn.relu(dense(first, jnp.concatenate([volume, point], axis=-1)))
-    return reach * jnp.tanh(dense(second, state))
+    return reach * jnp.tanh(raised(dense(second, state)))
 
 
 class DynamicViews(NamedTuple):
@@ -144,11 +144,12 @@ def dynamic_field(params, point, direction, volume, samples, views, *, reach=1.0
         colour = jnp.clip(colour + RESIDUAL * residual, 0, 1)
     else:
         colour = direct_colour(params.colour, state, direction)
-    raw_flow = dense(params.flow, state)
+    head = lambda part: raised(dense(part, state))
+    raw_flow = head(params.flow)
     flow = reach * jnp.tanh(raw_flow) if early is None else early + 0.2 * reach * jnp.tanh(raw_flow)
-    confidence = jax.nn.sigmoid(dense(params.confidence, state) + 2.0)
-    logit = jnp.zeros_like(state[:, 0]) if params.blend is None else dense(params.blend, state)[:, 0]
+    confidence = jax.nn.sigmoid(head(params.confidence) + 2.0)
+    logit = jnp.zeros_like(raw_flow[:, 0]) if params.blend is None else head(params.blend)[:, 0]
     return DynamicSample(
-        4 * jax.nn.softplus(dense(params.density, state)[:, 0]), colour, logit,
+        4 * jax.nn.softplus(head(params.density)[:, 0]), colour, logit,
         flow[:, :3], flow[:, 3:], confidence[:, 0], confidence[:, 1],
     )  # fmt: skip

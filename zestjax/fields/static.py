@@ -24,7 +24,7 @@ from zestjax.fields.trunk import (
     trunk,
     view_scores,
 )
-from zestjax.nets.layers import Dense, dense, init_dense
+from zestjax.nets.layers import Dense, dense, init_dense, raised
 
 VIEW_FEATURES = 13
 POOLED = 16
@@ -138,8 +138,8 @@ def static_field(params, point, direction, volume, samples, views, *, conditioni
         colour = jnp.clip(colour + RESIDUAL * residual, 0, 1)
     else:
         colour = direct_colour(params.colour, state, direction)
-    density = 4 * jax.nn.softplus(dense(params.density, state)[:, 0])
-    logit = dense(params.blend, state)[:, 0]
+    density = 4 * jax.nn.softplus(raised(dense(params.density, state))[:, 0])
+    logit = raised(dense(params.blend, state))[:, 0]
     return StaticSample(density, colour, jax.nn.sigmoid(logit), logit)
 
 

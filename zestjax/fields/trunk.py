@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from zestjax.checks import check_option
 from zestjax.fields.conditioning import added
-from zestjax.nets.layers import Dense, dense, init_dense
+from zestjax.nets.layers import Dense, dense, init_dense, lowered, raised
 
 
 class Trunk(NamedTuple):
@@ -63,7 +63,7 @@ def trunk(params, x, condition, *, conditioning="multiply"):
     """
     check_option("trunk", conditioning=(conditioning, ("multiply", "add")))
     modulation = dense(params.condition, condition)
-    hidden = x
+    hidden = x = lowered(x, params.condition.kernel)
     for layer in params.layers:
         if layer.kernel.shape[0] > hidden.shape[-1]:
             hidden = jnp.concatenate([x, hidden], axis=-1)
@@ -86,6 +86,7 @@ def lifted(params, features):
     One product per view, the bias as one more row: the gradients are products too, not slow sums.
     """
     kernel = jnp.concatenate([params.lift.kernel, params.lift.bias[None]]).T
+    features = lowered(features, kernel)
     ones = jnp.ones_like(features[0, :1])
     return [kernel @ jnp.concatenate([view, ones]) for view in features]
 
@@ -95,7 +96,8 @@ def pooled_views(lift, weights):
     weights = weights + 1e-3
     total = added(weights[v] for v in range(len(lift)))
     share = jax.lax.optimization_barrier(weights / total[None])
-    return added(share[v][None] * jax.nn.relu(view) for v, view in enumerate(lift)).T
+    share = lowered(share, lift[0])
+    return raised(added(share[v][None] * jax.nn.relu(view) for v, view in enumerate(lift)).T)
 
 
 def view_scores(params, lift, hidden):
@@ -108,7 +110,7 @@ def view_scores(params, lift, hidden):
     """
     query = dense(params.query, hidden).T
     kernel = params.score.kernel.T
-    return jnp.concatenate([kernel @ jax.nn.relu(view + query) for view in lift]) + params.score.bias[0]
+    return raised(jnp.concatenate([kernel @ jax.nn.relu(view + query) for view in lift]) + params.score.bias[0])
 
 
 def blend_of_views(scores, prior, visible, colour):
@@ -143,5 +145,6 @@ def init_colour_head(key, n_hidden, n_view):
 
 def direct_colour(params, hidden, direction):
     """(P, 3) in (0, 1) from the state and the encoded direction."""
-    features = jnp.concatenate([dense(params.feature, hidden), direction], axis=-1)
-    return jax.nn.sigmoid(dense(params.colour, jax.nn.relu(dense(params.hidden, features))))
+    features = dense(params.feature, hidden)
+    features = jnp.concatenate([features, lowered(direction, params.feature.kernel)], axis=-1)
+    return jax.nn.sigmoid(raised(dense(params.colour, jax.nn.relu(dense(params.hidden, features)))))

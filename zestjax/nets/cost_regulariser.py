@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from zestjax.checks import check_shapes
 from zestjax.nets.conv3d import conv3d, conv3d_transpose
-from zestjax.nets.layers import Block, Dense, dense, init_block3d, init_dense, norm_act
+from zestjax.nets.layers import Block, Dense, dense, init_block3d, init_dense, lowered, norm_act, raised
 
 
 class CostRegulariser(NamedTuple):
@@ -72,7 +72,8 @@ def cost_regulariser(params, volume, *, lowering="auto", legacy_abs=False):
     conv = lambda block, x, stride=1: act(block, conv3d(x, block.conv.kernel, stride=stride, lowering=lowering))
     size, step = volume.shape[:3], 2 ** len(params.downs)
     padding = [(0, -n % step) for n in size]
-    x = conv(params.stem, jnp.pad(volume, [*padding, (0, 0)], mode="edge"))
+    x = lowered(volume, params.stem.conv.kernel)
+    x = conv(params.stem, jnp.pad(x, [*padding, (0, 0)], mode="edge"))
     skips = []
     for halve, follow in params.downs:
         skips.append(x)
@@ -80,4 +81,4 @@ def cost_regulariser(params, volume, *, lowering="auto", legacy_abs=False):
     for double, skip in zip(params.ups[::-1], skips[::-1], strict=True):
         x = act(double, conv3d_transpose(x, double.conv.kernel, lowering=lowering)) + skip
     x = x[: size[0], : size[1], : size[2]]
-    return x if params.head is None else dense(params.head, x)
+    return raised(x if params.head is None else dense(params.head, x))

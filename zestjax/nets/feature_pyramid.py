@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.checks import check_option, check_shapes
-from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d
+from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d, raised
 
 STRIDES = (1, 1, 2, 1, 1, 2, 1, 1)
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -73,4 +73,4 @@ def feature_pyramid(params, images, *, normalise="imagenet", legacy_abs=False):
     x = imagenet_normalised(images) if normalise == "imagenet" else images
     for block, stride in zip(params.blocks, STRIDES, strict=True):
         x = block2d(block, x, stride=stride, legacy_abs=legacy_abs)
-    return conv2d(params.head, x)
+    return raised(conv2d(params.head, x))

@@ -4,7 +4,8 @@ Vocabulary:
   kernel: the weights of a linear map; its last two axes are channels in and channels out.
   norm-act: centre and scale by the statistics of the batch at hand (or stored ones), scale and offset, leaky ReLU.
 
-Parameters are arrays only and float32 unless the caller casts them; what a layer is, is read off their shapes.
+Parameters are arrays only and float32 unless the caller casts them; what a layer is, is read off their shapes. Cast to
+half precision they take their input down with them; a batch's statistics are found in float32 even then.
 """
 
 import math
@@ -116,6 +117,16 @@ def init_block3d(key, n_in, n_out):
     return Block(init_conv3d(key, n_in, n_out), init_norm(n_out))
 
 
+def lowered(x, kernel):
+    """x in the kernel's precision where that is a half one; as it is beside any other."""
+    return x.astype(kernel.dtype) if jnp.finfo(kernel.dtype).bits < 32 else x
+
+
+def raised(x):
+    """x in float32 where it is of a half precision: what leaves a network."""
+    return x.astype(jnp.float32) if jnp.finfo(x.dtype).bits < 32 else x
+
+
 def add_bias(x, bias):
     """x (..., C) + bias (C,), written as a product with ones so that the gradient's sum is a matrix product too."""
     ones = jnp.ones((x.size // x.shape[-1], 1), x.dtype)
@@ -129,7 +140,7 @@ def dense(params, x):
       ValueError: if the last axis of x is not what the kernel takes.
     """
     check_shapes("dense", kernel=(params.kernel, "in out"), x=(x, "... in"))
-    return add_bias(x @ params.kernel, params.bias)
+    return add_bias(lowered(x, params.kernel) @ params.kernel, params.bias)
 
 
 def conv2d(params, x, *, stride=1):
@@ -147,6 +158,7 @@ def conv2d(params, x, *, stride=1):
     """
     check_shapes("conv2d", kernel=(params.kernel, "size size in out"), x=(x, "B H W in"))
     check_option("conv2d", stride=(stride, (1, 2)))
+    x = lowered(x, params.kernel)
     if params.kernel.shape[0] == 1:
         out = x[:, ::stride, ::stride] @ params.kernel[0, 0]
     else:
@@ -180,13 +192,16 @@ def norm_act(params, x, *, slope=0.01, over="batch", epsilon=1e-5, legacy_abs=Fa
         out = add_bias(x * add_bias(jnp.zeros_like(x), rate), params.offset - params.statistics.mean * rate)
         return jnp.where(out > 0, out, slope * out)
     if over == "channels":
-        centred = x - jnp.mean(x, axis=-1, keepdims=True)
+        wide = raised(x)
+        centred = wide - jnp.mean(wide, axis=-1, keepdims=True)
         unit = centred * lax.rsqrt(jnp.mean(jnp.square(centred), axis=-1, keepdims=True) + epsilon)
+        unit = unit.astype(x.dtype)
         out = add_bias(unit * add_bias(jnp.zeros_like(x), scale), params.offset)
         return jnp.where(out > 0, out, slope * out)
     groups = x.shape[0] if over == "element" else 1
     flat = x.reshape(groups, -1, x.shape[-1])
-    return _norm_act(slope, epsilon, scale, params.offset, flat).reshape(x.shape)
+    wide = (raised(part) for part in (scale, params.offset, flat))
+    return _norm_act(slope, epsilon, *wide).reshape(x.shape).astype(x.dtype)
 
 
 def _mean(x):

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from zestjax.checks import check_option
+from zestjax.nets.layers import raised
 
 
 def positional_encoding(x, *, levels, order="frequency_major"):
@@ -23,7 +24,7 @@ def positional_encoding(x, *, levels, order="frequency_major"):
     Source: ZeST-NeRF sec. 3 (10 levels for points and time, 4 for directions).
     """
     check_option("positional_encoding", order=(order, ("frequency_major", "mvsnerf")))
-    x = x.astype(jnp.float64 if x.dtype == jnp.float64 else jnp.float32)
+    x = raised(x)
     octaves = jnp.concatenate([x[..., None, :] * 2**k for k in range(levels)] or [x[..., None, :][..., :0, :]], axis=-2)
     waves = [jnp.sin(octaves), jnp.cos(octaves)]
     axis = -1 if order == "frequency_major" else -2

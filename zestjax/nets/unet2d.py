@@ -7,7 +7,7 @@ import jax
 
 from zestjax.checks import check_shapes
 from zestjax.nets.conv2d import doubled_convolve2d
-from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d, norm_act
+from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d, norm_act, raised
 
 OVER = "channels"  # statistics of an image would make its faintest motion look like any other's strongest
 
@@ -70,4 +70,4 @@ def unet2d(params, x):
     for up, skip in zip(params.ups[::-1], skips[::-1], strict=True):
         x = doubled_convolve2d(x, up.conv.kernel)[:, : skip.shape[1], : skip.shape[2]]
         x = norm_act(up.norm, x, over=OVER) + skip
-    return conv2d(params.head, block(params.last, x))
+    return raised(conv2d(params.head, block(params.last, x)))
