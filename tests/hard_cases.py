@@ -11,9 +11,11 @@ import numpy as np
 
 from zestjax import cost_volume, depth, flow, frustum, metrics, numerics, planesweep, rays, rendering, resample, trust
 from zestjax.cameras import Camera, project, unproject
-from zestjax.losses import means, photometric, priors, regularisers, scene_flow
+from zestjax.fields.conditioning import SourceViews, hidden, over_views, sample_views
+from zestjax.losses import adversarial, means, photometric, priors, regularisers, scene_flow, supervision
 from zestjax.nets.layers import Norm, norm_act
 from zestjax.nets.positional import positional_encoding
+from zestjax.simulate.motion import rotation_from_vector
 
 
 class Case(NamedTuple):
@@ -90,6 +92,34 @@ def volume_of(poses, planes=(1.0, 4.0)):
         return jnp.concatenate([out.mean, out.variance], -1)
 
     return fn
+
+
+def fitted(homography):
+    """A trusted sweep as the camera behind it is fitted: the mean of what is seen."""
+    surface = like(homography, np.full((1, 6, 8), 0.5))
+    maps = trust.Trust(surface, surface, 0.1 * surface)
+    out = cost_volume.cost_volume(
+        like(homography, IMAGE)[None], homography[None, None], planesweep.sweep_grid(4, 5, dtype=homography.dtype),
+        trust=maps, depths=like(homography, [2.0]),
+    )  # fmt: skip
+    return out.mean
+
+
+def shown(points):
+    """What one view that knows its own depth shows of points: colours, and whether they are hidden."""
+    one = lambda x: like(points, x)[None]
+    table = np.concatenate([draw(10, 6, 8, 3), np.full((6, 8, 2), 0.5), np.full((6, 8, 1), 1e-3)], -1)
+    at = sample_views(SourceViews(one(table), Camera(one(K), one(POSE)), one(1.0), one(0.0)), points[None])
+    return jnp.concatenate([at.colour[0].T, hidden(at.gap).T], -1)
+
+
+def confident(confidence):
+    """A mean by confidence in which only the first of two is valid."""
+    residual = jnp.stack([jnp.ones_like(confidence), jnp.full_like(confidence, jnp.nan)])
+    both = jnp.stack([confidence, jnp.full_like(confidence, jnp.nan)])
+    return means.mean_over_valid(
+        "case", residual, valid=like(confidence, [1, 0]), confidence=both, normalise="confidence"
+    )
 
 
 def blended(static, dynamic, b):
@@ -197,6 +227,12 @@ CASES = [
         i, jnp.full((2, 2), np.nan, i.dtype)).values, (IMAGE,), np.zeros((2, 2))),
     Case("a volume's very edge", "a neighbour outside", lambda c: resample.trilinear(
         jnp.asarray(draw(7, 2, 3, 4, 1), c.dtype), c), (array([0, 0, 0], [0.5, 1.25, 0.75]),)),
+    Case("a sweep through the source's own plane, its camera being fitted", "1 / 0 in the inverse depth", fitted,
+         (array([1, 0, 0], [0, 1, 0], [0.5, 0, -1]),)),
+    Case("1-pixel tables", "a side of length 0", lambda t: cost_volume.cost_volume(
+        t, like(t, np.eye(3))[None, None], planesweep.sweep_grid(1, 1, dtype=t.dtype)).mean, (draw(12, 1, 1, 1, 2),)),
+    Case("a rotation by 0", "the angle's norm at 0", rotation_from_vector, (np.zeros(3, np.float32),), np.eye(3)),
+    Case("a rotation by pi", "the sine of pi", rotation_from_vector, (array(np.pi, 0, 0),), np.diag([1, -1, -1]), 1e-5),
     # flow
     Case("zero flow", "|f| at 0", lambda f: scene_flow.minimum_flow_loss(f), (np.zeros((4, 3), np.float32),), 0.0),
     Case("zero flow's smoothness", "the norm of 0", scene_flow.spatial_smoothness_loss,
@@ -213,7 +249,28 @@ CASES = [
         "case", jnp.stack([x, jnp.full_like(x, jnp.nan)]), valid=jnp.asarray([1.0, 0.0], x.dtype)), (RAY,), 1.4),
     Case("no neighbour at all", "0 / 0", lambda x: means.mean_over_valid(
         "case", x[None], valid=jnp.zeros(1, x.dtype)), (RAY,), 0.0),
+    # views
+    Case("points that a view does not see", "its maps read 0: a division by the tolerance", shown,
+         (array([0.3, 0.1, -3], [0, 0, 0], [90, 0, 2]),), np.zeros((3, 4))),
+    Case("a point far behind a view's surface", "the gap overflows", shown, (array([1e3, 500, 1e4]),)),
+    Case("no view is trusted", "a weighted mean of weights 0", over_views,
+         (np.zeros((2, 3), np.float32), draw(11, 2, 4, 3)), np.zeros((4, 3))),
     # losses
+    Case("a confidence that is missing", "NaN in the sum of confidences", confident, (array(0.5, 0.25),), 1.0),
+    Case("a depth that the planes exclude", "0 times the logarithm of 0", lambda p: (
+        supervision.depth_cross_entropy_loss(jnp.stack([p, p, like(p, -np.inf), like(p, -np.inf)]), like(p, 0.5))),
+        (np.float32(-0.6931472),), 0.6931472),
+    Case("certain and wrong of what moves", "the logarithm of 0", lambda d: supervision.motion_mask_loss(
+        d, 1 - like(d, [0, 1])), (array(0, 1),)),
+    Case("a discriminator that is certain", "exp overflows", adversarial.generator_loss, (array(200, -200),)),
+    Case("a kernel of zeros", "its greatest singular value is 0", lambda k: adversarial.spectral_norm(
+        k.reshape(1, 1, 3, 3)), (np.zeros(9, np.float32),), 0.0, 1e-3, unit=1e-3),
+    Case("a depth whose truth is unknown", "NaN in the residual", lambda d: metrics.depth_abs_rel(
+        d, like(d, [[2.0, np.nan, 0.0]]), None), (array([3.0, 1.0, 1.0]),), 0.5),
+    Case("a flow whose truth is unknown", "NaN in the norm", lambda f: metrics.endpoint_error(
+        f, like(f, [[[0, 0], [np.nan, 1]]]), None), (array([[3.0, 4.0], [1.0, 1.0]]),), 5.0),
+    Case("a flow equal to the truth", "the norm of 0", lambda f: metrics.endpoint_error(f, 0 * f, None),
+         (np.zeros((2, 3, 2), np.float32),), 0.0),
     Case("entropy at 0 and 1", "0 log 0", regularisers.blend_entropy_loss, (array(0, 1),), 0.0),
     Case("entropy of logits at 200", "exp overflows", lambda z: regularisers.blend_entropy_loss(
         z, given="logit", symmetric=True), (array(-200, 200),), 0.0),

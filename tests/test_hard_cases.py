@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from hard_cases import CASES
 
+from zestjax.testing.walk import program, run
+
 NAMED = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 
 
@@ -52,6 +54,26 @@ def test_eager_compiled_and_mapped_agree(case):
     twice = value_and_gradients(case, tuple(jnp.stack([x, x]) for x in args), run=lambda f: jax.jit(jax.vmap(f)))
     for row in (0, 1):
         close(case, jax.tree.map(lambda x, row=row: x[row], twice), compiled, "vmap and grad of vmap")
+
+
+@NAMED
+def test_nothing_on_the_way_is_not_a_number(case):
+    """So that a user may search for the cause of a NaN of their own with `jax_debug_nans`."""
+    args, found = tuple(map(jnp.asarray, case.args)), []
+    for fn in (case.fn, jax.grad(scalar(case), argnums=tuple(range(len(args))))):
+
+        def visit(equation, inputs, outputs):
+            if not any(map(has_nan, inputs)) and any(map(has_nan, outputs)):
+                found.append(equation)
+            return outputs
+
+        closed, leaves, _ = program(fn, *args)
+        run(closed, leaves, visit)
+    assert not found, f"{case.name}: {found[0]}"
+
+
+def has_nan(x):
+    return jnp.issubdtype(x.dtype, jnp.floating) and bool(jnp.isnan(x).any())
 
 
 @NAMED

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax.checks import check_shapes
+from zestjax.numerics import safe_norm
 
 PSNR_CAP = 100.0
 """dB given to identical images, whose PSNR is infinite: no 8-bit image that differs at all reaches it."""
@@ -134,7 +135,7 @@ def endpoint_error(flow, truth, mask):
     """
     check_shapes("endpoint_error", flow=(flow, "H W 2"), truth=(truth, "H W 2"))
     known = jnp.all(jnp.isfinite(truth), axis=-1)
-    error = jnp.linalg.norm(flow - jnp.where(known[..., None], truth, 0), axis=-1)
+    error = safe_norm(flow - jnp.where(known[..., None], truth, 0))
     mask = known if mask is None else jnp.where(known, jnp.asarray(mask, flow.dtype), 0)
     return mean_where(error, mask, where="endpoint_error")
 
