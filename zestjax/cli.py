@@ -97,6 +97,7 @@ def _train(commands):
         "--scenes", nargs="+", default=(), metavar="PATH", help="learn from these (default: simulated)"
     )
     command.add_argument("--steps", type=_positive, default=20_000, help="in all, and length of the schedule")
+    command.add_argument("--precision", default="float32", help="of the networks: float32 or bfloat16")
     command.add_argument("--peak", type=_positive_float, default=2e-3, help="highest learning rate (default 0.002)")
     command.add_argument("--minutes", type=_positive_float, metavar="M", help="stop after so much stepping in all")
     command.add_argument("--resume", action="store_true", help="go on from the folder's newest checkpoint")
@@ -128,6 +129,7 @@ def _render(commands):
     command.add_argument("--frames", type=_positive, help="of the path (default: twice the video's)")
     command.add_argument("--budget-seconds", type=_positive_float, metavar="S", help="for all frames: renders smaller")
     command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
+    command.add_argument("--precision", help="float32, bfloat16 (networks only) or float64 (default: the weights' own)")
     command.add_argument("--fps", type=_positive_float, default=12.0)
 
 
@@ -138,6 +140,7 @@ def _evaluate(commands):
     command.add_argument("--protocol", default="held-out", help="held-out, strict or paper (default held-out)")
     command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: all)")
     command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
+    command.add_argument("--precision", help="float32, bfloat16 (networks only) or float64 (default: the weights' own)")
     command.add_argument("--lpips", type=Path, metavar="FILE", help="LPIPS's weights, from import-lpips (default: n/a)")
     command.add_argument("--no-pictures", dest="pictures", action="store_false", help="write metrics.json only")
 

@@ -150,7 +150,7 @@ def encode_volume(params, views, camera, size, depths, *, colours, trusted, slot
     Differs from the reference: the motion volume is swept too (theirs stacks features unwarped); trusted views only.
     """
     sizes = check_shapes("encode_volume", tables=(views.tables, "V h w C"), depths=(depths, "D"))
-    grid = sweep_grid(*size)
+    grid = sweep_grid(*size, dtype=views.tables.dtype)
     hom = homographies(camera, views.cameras, depths) * views.valid[None, :, None, None]
     tables, trust = views.tables, None
     if trusted:

@@ -18,7 +18,7 @@ from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
 from zestjax.apps.tables import headline, write_table
-from zestjax.apps.weights import PUBLISHED, open_weights, standing_still
+from zestjax.apps.weights import PUBLISHED, at_precision, open_weights, standing_still
 from zestjax.io.files import write_bytes
 from zestjax.io.inputs import check_target
 from zestjax.io.lpips import load_lpips
@@ -42,6 +42,7 @@ class EvaluateOptions:
     pictures: bool = True
     lpips: Path | None = None
     still: bool = False
+    precision: str | None = None
     seed: int = 0
     quiet: bool = False
 
@@ -56,6 +57,7 @@ def evaluate(options):
       ValueError, WeightsError: a scene, a target or weights that cannot be used.
     """
     model = open_weights(options.weights, system=options.system, published=True)
+    model = at_precision(model, options.precision)
     if options.scene != "bench:all":
         report = evaluate_scene(model, options, Path(options.out))
         return f"evaluate: {headline(report)}: {Path(options.out) / 'metrics.json'}"
@@ -91,7 +93,8 @@ def score_scene(view_of, opened, options, out):
     height, width = scene.video.images.shape[1:3]
     report = {
         "scene": scene.name, "system": model.system, "protocol": options.protocol, "height": height, "width": width,
-        "preset": model.config.name, "device": device_name(), "weights": str(model.path),
+        "preset": model.config.name, "precision": getattr(model.config, "precision", "float32"),
+        "device": device_name(), "weights": str(model.path),
         **summary(rows), "prepare_seconds": number(view_of.prepare_seconds),
         "compile_seconds": number(view_of.compile_seconds), "targets": [row["row"] for row in rows],
     }  # fmt: skip

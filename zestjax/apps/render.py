@@ -12,7 +12,7 @@ from zestjax.apps.paths import camera_path
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import number
-from zestjax.apps.weights import open_weights, standing_still
+from zestjax.apps.weights import at_precision, open_weights, standing_still
 from zestjax.cameras import resized
 from zestjax.io.files import write_bytes
 from zestjax.io.inputs import check_target
@@ -37,6 +37,7 @@ class RenderOptions:
     format: str | None = None
     fps: float = 12.0
     still: bool = False
+    precision: str | None = None
     seed: int = 0
     quiet: bool = False
 
@@ -50,7 +51,8 @@ def render(options):
     Raises:
       ValueError, WeightsError: a scene, a path or weights that cannot be used.
     """
-    model, out = open_weights(options.weights, published=True), Path(options.out)
+    model = at_precision(open_weights(options.weights, published=True), options.precision)
+    out = Path(options.out)
     scene = open_scene(options.scene, model.config, size=options.size, protocol=None, layout=options.format).scene
     model = standing_still(model) if options.still else model
     path = camera_path(options.path, scene.video, count=options.frames)

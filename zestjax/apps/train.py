@@ -60,6 +60,7 @@ class TrainOptions:
     system: str = "zest"
     stage: str = "all"
     peak: float = 2e-3
+    precision: str = "float32"
 
 
 class Summary(NamedTuple):
@@ -80,7 +81,8 @@ def train(options):
       ValueError, WeightsError: bad options; the folder holds another run; a damaged checkpoint.
     """
     check_option("train", system=(options.system, tuple(SYSTEMS)), stage=(options.stage, STAGES))
-    config = preset_of(options.preset, **SYSTEMS[options.system])
+    check_option("train", precision=(options.precision, ("float32", "bfloat16")))
+    config = preset_of(options.preset, precision=options.precision, **SYSTEMS[options.system])
     if options.scenes and options.stage == "frames":
         raise ValueError("train: --stage frames learns from exact answers, which --scenes lack; drop one of them.")
     if options.stage != "all" and config.encoder != "frames":

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from zestjax.checks import check_option
 from zestjax.io.mvsnerf import mvsnerf_like, read_mvsnerf
 from zestjax.io.weights import WeightsError, load_weights, read_metadata, save_weights
 from zestjax.model import init_params
@@ -99,6 +100,25 @@ def standing_still(model):
         return model
     params = model.params._replace(motion=None, dynamic=None)
     return model._replace(params=params, config=dataclasses.replace(model.config, dynamic=False, motion=False))
+
+
+def at_precision(model, precision):
+    """The `Model` run at a precision of `precision.PRECISIONS`, or, of None, as it is.
+
+    `float64` switches on 64-bit JAX for the rest of the process.
+
+    Raises:
+      ValueError: an unknown precision, or another than float32 for MVSNeRF's weights.
+    """
+    if precision is None:
+        return model
+    if model.system == PUBLISHED:
+        check_option("--precision, of MVSNeRF's weights,", precision=(precision, ("float32",)))
+        return model
+    model = model._replace(config=dataclasses.replace(model.config, precision=precision))
+    if precision == "float64":
+        jax.config.update("jax_enable_x64", True)
+    return model
 
 
 def import_mvsnerf(path, out, *, statistics="batch"):
