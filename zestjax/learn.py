@@ -56,7 +56,7 @@ def scene_terms(maps, encoded, batch, weights):
     log = lambda logits: jax.nn.log_softmax(jnp.moveaxis(logits, 0, -1), axis=-1)
 
     def depth_ce(_, batch):
-        total = jnp.zeros(())
+        total = jnp.zeros((), batch.static_planes.dtype)
         if geometry is not None:
             total += depth_cross_entropy_loss(
                 log(geometry.logits), batch.static_planes, valid=batch.static_planes_valid
@@ -192,7 +192,7 @@ def step_gradients(config, *, weights=FRAME_WEIGHTS):
     def gradients(params, batch):
         batch = geometry_at(config.precision, batch)
         scene = lambda p: _scene(p, batch, config=config, weights=weights)
-        (encoded, _), pull, (maps, terms) = jax.vjp(scene, params, has_aux=True)
+        (encoded, of_scene), pull, (maps, terms) = jax.vjp(scene, params, has_aux=True)
         encoding = jax.lax.stop_gradient(assemble(batch.inputs, maps, encoded, config=config))
         tables = (encoding.key, encoding.slots, encoding.guides)
         gradient = jax.value_and_grad(rays, argnums=(0, 1), has_aux=True)
@@ -202,7 +202,7 @@ def step_gradients(config, *, weights=FRAME_WEIGHTS):
             return found, grads
 
         found, (towards_params, towards_encoded) = mean_over_blocks(of_block, _blocks(batch.truth, config.ray_blocks))
-        (through,) = pull((towards_encoded, jnp.ones(())))
+        (through,) = pull((towards_encoded, jnp.ones_like(of_scene)))
         grads = jax.tree.map(jnp.add, towards_params, through)
         terms = Terms(*(a if a is not None else b for a, b in zip(terms, found, strict=True)))
         total = weighted_sum(terms, Terms(*(w if t is not None else None for t, w in zip(terms, weights, strict=True))))

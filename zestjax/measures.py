@@ -27,6 +27,7 @@ from zestjax.rendering import composite, confidence_map, weights_from_density
 
 DIRECTIONS = (1, -1)
 NEAR_SURFACE = 0.05  # share of the depth within which a sample counts as on the true surface
+LEAST_WEIGHT = 1e-3  # less is none: a mean by weights that nearly underflow would be all noise
 
 
 class Truth(NamedTuple):
@@ -190,7 +191,7 @@ def _surface_flow(flows, prediction, truth):
     """Scene flow of the samples at the true surface, against the truth, as a share of the depth; ten times that."""
     depth = jnp.where(truth.flow_valid > 0, truth.depth, 1)
     weight = jnp.exp(-jnp.square((prediction.marched.depths / depth[:, None] - 1) / NEAR_SURFACE))
-    weight = jax.lax.stop_gradient(weight) * truth.flow_valid[:, None]
+    weight = jax.lax.stop_gradient(jnp.where(weight > LEAST_WEIGHT, weight, 0)) * truth.flow_valid[:, None]
     error = jnp.abs(flows - jnp.moveaxis(truth.flow, 1, 0)[:, :, None]) / depth[None, :, None, None]
     each = [mean_over_valid("flow3d", jnp.minimum(e, 1.0), valid=weight) for e in error]
     return 5 * (each[0] + each[1])
@@ -199,7 +200,7 @@ def _surface_flow(flows, prediction, truth):
 def _geometric(prediction, truth, inputs, slots, flows):
     """Where the neighbours' cameras see each ray's expected point, against where the optical flow prior does."""
     point = unproject(inputs.camera, truth.pixels, truth.depth)
-    total = jnp.zeros(())
+    total = jnp.zeros((), truth.depth.dtype)
     for flow, sign, known in zip(flows, DIRECTIONS, jnp.moveaxis(truth.flow, 1, 0), strict=True):
         index = jnp.argmax((slots.times == sign).astype(jnp.int32))
         camera = jax.tree.map(lambda x, index=index: x[index], slots.cameras)

@@ -1,0 +1,88 @@
+"""A training step of every hard scene is finite, right against float64, and spoils no neighbour in a batch."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import stage
+from hard_scenes import SCENES
+from stage import MINI, PAPER
+
+from zestjax.learn import FRAME_WEIGHTS, step_gradients
+from zestjax.losses.objective import PAPER_WEIGHTS
+
+SYSTEMS = {"mini": (MINI, FRAME_WEIGHTS), "paper": (PAPER, PAPER_WEIGHTS)}
+BY_SYSTEM = pytest.mark.parametrize("system", SYSTEMS)
+BY_SCENE = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
+
+
+@functools.cache
+def compiled(system, precision="float32", mapped=False):
+    """(params, batch) -> (gradient, losses)."""
+    config, weights = SYSTEMS[system]
+    gradients = step_gradients(dataclasses.replace(config, precision=precision), weights=weights)
+    fn = lambda params, batch: (lambda out: (out[0], out[1]._asdict()))(gradients(params, batch))
+    return jax.jit(jax.vmap(fn) if mapped else fn)
+
+
+def hard(system, scene):
+    config, _ = SYSTEMS[system]
+    return scene.change(stage.params_of(config), stage.batch(config), config)
+
+
+def flat(tree):
+    return np.concatenate([np.ravel(np.asarray(leaf, np.float64)) for leaf in jax.tree.leaves(tree)])
+
+
+def assert_close(ours, theirs, tolerance):
+    """Each loss, and the gradient as one vector."""
+    (gradient, losses), (exact_gradient, exact_losses) = ours, theirs
+    for name, loss in losses.items():
+        if loss is not None:
+            np.testing.assert_allclose(loss, exact_losses[name], rtol=tolerance, atol=1e-5, err_msg=name)
+    gradient, exact_gradient = flat(gradient), flat(exact_gradient)
+    away = np.linalg.norm(gradient - exact_gradient) / max(np.linalg.norm(exact_gradient), 1e-6)
+    assert away < tolerance, f"gradient: {away:.1e} of its norm away"
+
+
+@BY_SYSTEM
+@BY_SCENE
+def test_losses_and_gradients_are_finite_and_those_of_float64(scene, system):
+    ours = compiled(system)(*hard(system, scene))
+    assert np.isfinite(flat(ours)).all()
+    with jax.enable_x64(True):
+        exact = compiled(system, "float64")(*hard(system, scene))
+    assert_close(ours, exact, scene.tolerance)
+
+
+@BY_SYSTEM
+def test_a_hard_scene_does_not_spoil_its_neighbours_in_a_batch(system):
+    """All scenes mapped over at once: each is what it is alone."""
+    alone = [compiled(system)(*hard(system, scene)) for scene in SCENES]
+    stacked = jax.tree.map(lambda *rows: jnp.stack([jnp.asarray(r) for r in rows]), *(hard(system, s) for s in SCENES))
+    together = compiled(system, mapped=True)(*stacked)
+    for i, scene in enumerate(SCENES):
+        assert_close(jax.tree.map(lambda x, i=i: x[i], together), alone[i], scene.tolerance)
+
+
+@BY_SYSTEM
+@BY_SCENE
+def test_half_precision_networks_are_finite_there(scene, system):
+    assert np.isfinite(flat(compiled(system, "bfloat16")(*hard(system, scene)))).all()
+
+
+@pytest.mark.slow
+@BY_SYSTEM
+def test_run_eagerly_it_is_the_same(system):
+    config, weights = SYSTEMS[system]
+    for scene in SCENES[:2]:
+        args = hard(system, scene)
+        grads, losses, _ = step_gradients(config, weights=weights)(*args)
+        assert_close((grads, losses._asdict()), compiled(system)(*args), scene.tolerance)
+
+
+def test_names_are_unique_and_causes_told():
+    assert len({scene.name for scene in SCENES}) == len(SCENES) and all(scene.cause for scene in SCENES)
