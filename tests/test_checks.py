@@ -36,3 +36,9 @@ def test_an_unknown_option_is_refused_with_the_valid_ones():
     check_option("f", mode=("a", ("a", "b")))
     with pytest.raises(ValueError, match="f: `mode` is 'c', expected one of 'a', 'b'"):
         check_option("f", mode=("c", ("a", "b")))
+
+
+def test_batch_axes_need_only_broadcast_and_misfits_are_named():
+    check_shapes("f", a=(jnp.ones((2, 1, 3)), "... S"), b=(jnp.ones((4, 3)), "... S"))
+    with pytest.raises(ValueError, match=r"f: batch axes that do not broadcast: \(2,\) of `a`, \(3,\) of `b`"):
+        check_shapes("f", a=(jnp.ones((2, 3)), "... S"), b=(jnp.ones((3, 3)), "... S"))

@@ -93,7 +93,7 @@ def project_in_camera(intrinsics, points):
 
 def unproject(camera, pixels, depth):
     """Pixels (..., 2) at depths (...) to world points (..., 3): the inverse of `project`."""
-    check_shapes("unproject", pixels=(pixels, "... 2"))
+    check_shapes("unproject", pixels=(pixels, "... 2"), depth=(depth, "..."))
     homogeneous = jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
     in_camera = matvec(intrinsics_inverse(camera.intrinsics), homogeneous) * depth[..., None]
     return transformed(rigid_inverse(camera.camera_from_world), in_camera)
@@ -149,7 +149,7 @@ def look_at(position, target, *, up):
       ValueError: if an argument does not end in 3.
     """
     check_shapes("look_at", position=(position, "... 3"), target=(target, "... 3"), up=(up, "... 3"))
-    up = jnp.broadcast_to(up, position.shape).astype(position.dtype)
+    position, target, up = jnp.broadcast_arrays(position, target, jnp.asarray(up).astype(position.dtype))
     forward = _unit(target - position)
     sideways = jnp.cross(forward, _unit(up))
     spare = jnp.cross(forward, jnp.roll(jnp.abs(forward) + 1e-3, 1, axis=-1))

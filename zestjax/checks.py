@@ -1,6 +1,7 @@
 """Shape checks that run while JAX traces, and cost nothing once compiled."""
 
 import jax.numpy as jnp
+import numpy as np
 
 
 def check_shapes(where, /, **arrays):
@@ -8,8 +9,8 @@ def check_shapes(where, /, **arrays):
 
     Args:
       where: name of the calling function, used in the message.
-      **arrays: `name=(array, "... S C")`. A leading `...` frees the batch axes; a word is an axis that
-        must have one size everywhere; a digit is literal.
+      **arrays: `name=(array, "... S C")`. A leading `...` frees the batch axes, which need only broadcast against
+        each other; a word is an axis that must have one size everywhere; a digit is literal.
 
     Returns:
       dict from axis name to size.
@@ -17,13 +18,15 @@ def check_shapes(where, /, **arrays):
     Raises:
       ValueError: naming the function, the argument, the axis and both sizes.
     """
-    sizes, first = {}, {}
+    sizes, first, batches = {}, {}, {}
     for name, (array, spec) in arrays.items():
         axes, shape = spec.split(), jnp.shape(array)
         free = bool(axes) and axes[0] == "..."
         axes = axes[1:] if free else axes
         if len(shape) < len(axes) or (len(shape) > len(axes) and not free):
             raise ValueError(f"{where}: `{name}` should be ({spec}), got shape {shape}.")
+        if free:
+            batches[name] = shape[: len(shape) - len(axes)]
         for axis, size in zip(axes, shape[len(shape) - len(axes) :], strict=True):
             want = int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
             if size != want:
@@ -33,7 +36,16 @@ def check_shapes(where, /, **arrays):
                     f"({name} should be ({spec}), got shape {shape})."
                 )
             first.setdefault(axis, name)
+    _check_batches(where, batches)
     return sizes
+
+
+def _check_batches(where, batches):
+    try:
+        np.broadcast_shapes(*batches.values())
+    except ValueError:
+        listed = ", ".join(f"{shape} of `{name}`" for name, shape in batches.items())
+        raise ValueError(f"{where}: batch axes that do not broadcast: {listed}.") from None
 
 
 def check_option(where, /, **options):

@@ -60,7 +60,7 @@ def expected_depth(weights, depths, *, background=None):
     half-transparent ray comes out too near. `background=0.0` gives its value.
     """
     check_shapes("expected_depth", weights=(weights, "... S"), depths=(depths, "... S"))
-    depths = jnp.broadcast_to(depths, weights.shape)
+    weights, depths = jnp.broadcast_arrays(weights, depths)
     opacity, total = jnp.sum(weights, axis=-1), jnp.sum(weights * depths, axis=-1)
     if background is None:
         return (total + EMPTY * depths[..., -1]) / (opacity + EMPTY)
@@ -83,7 +83,7 @@ def median_depth(weights, depths):
       ValueError: if the sample axes differ.
     """
     check_shapes("median_depth", weights=(weights, "... S"), depths=(depths, "... S"))
-    depths = jnp.broadcast_to(depths, weights.shape)
+    weights, depths = jnp.broadcast_arrays(weights, depths)
     reached = jnp.cumsum(weights, axis=-1)
     half = reached[..., -1:] / 2
     index = jnp.where(half[..., 0] > EMPTY / 2, jnp.argmax(reached >= half, axis=-1), depths.shape[-1] - 1)
@@ -114,7 +114,7 @@ def masked_median(values, mask):
       ValueError: if the last axes differ.
     """
     check_shapes("masked_median", values=(values, "... P"), mask=(mask, "... P"))
-    mask = jnp.broadcast_to(mask, values.shape).astype(bool)
+    values, mask = jnp.broadcast_arrays(values, jnp.asarray(mask).astype(bool))
     count = jnp.sum(mask, axis=-1)
     ordered = jnp.sort(jnp.where(mask, values, jnp.inf), axis=-1)
     middle = jnp.maximum(count - 1, 0) // 2
@@ -136,11 +136,12 @@ def whitened(values, mask, *, floor=FLAT):
       `Whitened`.
 
     Raises:
-      ValueError: if the last axes differ.
+      ValueError: if the shapes do not fit.
 
     Differs from the reference: the spread has a floor, without which a flat map is 0 / 0.
     """
-    mask = jnp.broadcast_to(mask, values.shape).astype(values.dtype)
+    check_shapes("whitened", values=(values, "... P"), mask=(mask, "... P"))
+    values, mask = jnp.broadcast_arrays(values, jnp.asarray(mask).astype(values.dtype))
     centre = masked_median(values, mask)
     seen = jnp.where(mask > 0, values - centre[..., None], 0)
     count = jnp.sum(mask, axis=-1)
@@ -166,13 +167,15 @@ def align_least_squares(values, target, mask):
       ValueError: if the last axes differ.
     """
     check_shapes("align_least_squares", values=(values, "... P"), target=(target, "... P"), mask=(mask, "... P"))
-    mask = jnp.broadcast_to(mask, values.shape).astype(values.dtype)
+    values, mask = jnp.broadcast_arrays(values, jnp.asarray(mask).astype(values.dtype))
     count = jnp.sum(mask, axis=-1)
     mean = lambda x: jnp.sum(jnp.where(mask > 0, x, 0) * mask, axis=-1) / jnp.where(count > 0, count, 1)
     values_mean, target_mean = mean(values), mean(target)
     centred = jnp.where(mask > 0, values - values_mean[..., None], 0)
     unit = jax.lax.stop_gradient(jnp.max(jnp.abs(centred), axis=-1))
-    varied = unit > 4 * float(jnp.finfo(values.dtype).eps) * jnp.abs(values_mean)
+    limits = jnp.finfo(values.dtype)
+    # Below the cube root of the least number the slope of the scale, 1 / unit^2, has no room.
+    varied = unit > 4 * float(limits.eps) * jnp.abs(values_mean) + float(limits.tiny) ** (1 / 3)
     unit = jnp.where(varied, unit, 1)
     centred = centred / unit[..., None]
     variance, covariance = mean(centred**2), mean(centred * (target - target_mean[..., None]))

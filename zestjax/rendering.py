@@ -88,7 +88,8 @@ def alpha_from_density(density, lengths):
       ValueError: if the sample axes differ.
     """
     check_shapes("alpha_from_density", density=(density, "... S"), lengths=(lengths, "... S"))
-    return -jnp.expm1(-density * jnp.broadcast_to(lengths, density.shape))
+    density, lengths = jnp.broadcast_arrays(density, lengths)
+    return -jnp.expm1(-density * lengths)
 
 
 def weights_from_density(density, lengths):
@@ -113,7 +114,8 @@ def weights_from_density(density, lengths):
     agree to 2e-7 in float32 for S <= 128. The paper's print leaves the lengths out.
     """
     check_shapes("weights_from_density", density=(density, "... S"), lengths=(lengths, "... S"))
-    thickness = density * jnp.broadcast_to(lengths, density.shape)
+    density, lengths = jnp.broadcast_arrays(density, lengths)
+    thickness = density * lengths
     return -jnp.expm1(-thickness) * jnp.exp(-exclusive_cumsum(thickness))
 
 
@@ -176,8 +178,8 @@ def density_blend_weights(static_density, dynamic_density, blend, lengths):
         blend=(blend, "... S"),
         lengths=(lengths, "... S"),
     )
-    lengths = jnp.broadcast_to(lengths, blend.shape)
-    static, dynamic = static_density * lengths, dynamic_density * lengths
+    static, dynamic, blend, lengths = jnp.broadcast_arrays(static_density, dynamic_density, blend, lengths)
+    static, dynamic = static * lengths, dynamic * lengths
     reaching = jnp.exp(-exclusive_cumsum(static * (1 - blend) + dynamic * blend))
     return Blended(static=reaching * (1 - blend) * -jnp.expm1(-static), dynamic=reaching * blend * -jnp.expm1(-dynamic))
 

@@ -40,7 +40,12 @@ def trusted(static, inverse_depth, tolerance, point_inverse_depth):
     """Weight in [0, 1] of a source at a point: static and not hidden.
 
     static * exp(-(relu(inverse_depth - point) / tolerance)^2); the arguments are arrays of one shape, see the header.
+
+    Raises:
+      ValueError: the shapes do not broadcast.
     """
+    arrays = dict(inverse_depth=inverse_depth, tolerance=tolerance, point_inverse_depth=point_inverse_depth)
+    check_shapes("trusted", static=(static, "..."), **{name: (x, "...") for name, x in arrays.items()})
     gap = _gap(jax.nn.relu(inverse_depth - point_inverse_depth), tolerance)
     return static * jnp.exp(-gap * gap)
 

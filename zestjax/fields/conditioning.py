@@ -88,7 +88,11 @@ def over_views(weights, values):
     """Weighted mean over views: (V, P), (V, C, P) -> (C, P); 0 where all weights are 0.
 
     Written as a sum of products: sums over a leading axis are slow on a CPU.
+
+    Raises:
+      ValueError: on shapes that do not fit.
     """
+    check_shapes("over_views", weights=(weights, "V P"), values=(values, "V C P"))
     views = range(weights.shape[0])
     total = added(weights[v] for v in views)
     summed = added(weights[v][None] * values[v] for v in views)

@@ -53,7 +53,8 @@ def photometric_loss(warped, target, confidence, *, valid=None, normalise="count
       ValueError: if the shapes do not fit.
     """
     check_shapes("photometric_loss", warped=(warped, "... 3"), target=(target, "... 3"))
-    residual = warped - jnp.broadcast_to(target, warped.shape)
+    warped, target = jnp.broadcast_arrays(warped, target)
+    residual = warped - target
     return mean_over_valid(
         "photometric_loss", residual, norm="squared", valid=valid, confidence=confidence, normalise=normalise
     )

@@ -89,9 +89,9 @@ def spatial_smoothness_loss(flow, points, *, valid=None, weighting="distance", d
         raise ValueError(f"spatial_smoothness_loss: axis S of `flow` is {flow.shape[-2]}, of which {kept} kept; "
                          "expected at least 2.")  # fmt: skip
     between = lambda x: x[..., 1:kept, :] - x[..., : kept - 1, :]
-    residual = between(flow)
+    residual, steps = jnp.broadcast_arrays(between(flow), between(points))
     if weighting == "distance":
-        distance = safe_norm(jnp.broadcast_to(between(points), residual.shape), keepdims=True)
+        distance = safe_norm(steps, keepdims=True)
         residual = jnp.exp(-2 * distance) * residual
     return mean_over_valid("spatial_smoothness_loss", residual, norm="absolute", valid=valid)
 

@@ -26,7 +26,8 @@ def depth_cross_entropy_loss(log_probability, plane, *, valid=None):
     Raises:
       ValueError: if the shapes do not fit.
     """
-    planes = check_shapes("depth_cross_entropy_loss", log_probability=(log_probability, "... D"))["D"]
+    arrays = dict(log_probability=(log_probability, "... D"), plane=(plane, "..."))
+    planes = check_shapes("depth_cross_entropy_loss", **arrays)["D"]
     inside = (plane >= 0) & (plane <= planes - 1)
     plane = jnp.where(inside, plane, 0)
     index = jnp.arange(planes).astype(plane.dtype).reshape((1,) * plane.ndim + (planes,))
@@ -54,6 +55,7 @@ def motion_mask_loss(dynamicness, moving, *, valid=None, floor=1e-3):
     Raises:
       ValueError: if the shapes do not fit.
     """
+    check_shapes("motion_mask_loss", dynamicness=(dynamicness, "..."), moving=(moving, "..."))
     share = floor + (1 - 2 * floor) * dynamicness
     moving = jnp.asarray(moving).astype(share.dtype)
     cost = -(moving * jnp.log(share) + (1 - moving) * jnp.log1p(-share))

@@ -139,7 +139,7 @@ def dense(params, x):
     Raises:
       ValueError: if the last axis of x is not what the kernel takes.
     """
-    check_shapes("dense", kernel=(params.kernel, "in out"), x=(x, "... in"))
+    check_shapes("dense", kernel=(params.kernel, "in out"), bias=(params.bias, "out"), x=(x, "... in"))
     return add_bias(lowered(x, params.kernel) @ params.kernel, params.bias)
 
 
@@ -184,7 +184,7 @@ def norm_act(params, x, *, slope=0.01, over="batch", epsilon=1e-5, legacy_abs=Fa
     Raises:
       ValueError: if x does not have C channels, or on another `over`.
     """
-    check_shapes("norm_act", scale=(params.scale, "C"), x=(x, "... C"))
+    check_shapes("norm_act", scale=(params.scale, "C"), offset=(params.offset, "C"), x=(x, "... C"))
     check_option("norm_act", over=(over, ("batch", "element", "channels")))
     scale = jnp.abs(params.scale) + epsilon if legacy_abs else params.scale
     if params.statistics is not None:
