@@ -99,7 +99,7 @@ def test_a_camera_that_sees_nothing_of_the_video_renders_something_finite(scene)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(render_view(*scene, behind, 2, config=MINI)))
 
 
-@pytest.mark.parametrize("size", [(13, 18), (9, 5)])
+@pytest.mark.parametrize("size", [(13, 18), (9, 5), (1, 1)])
 def test_images_of_any_size_are_rendered(scene, size):
     video = stage.video(size)
     out = render_view(scene[0], prepare(scene[0], video, config=MINI), stage.camera(0.1, size), 2, config=MINI)

@@ -124,3 +124,10 @@ def test_a_gradient_that_is_not_finite_though_the_value_is():
 def test_losses_must_be_scalars_by_name():
     with pytest.raises(ValueError, match=r"should give scalars by name, got \{'a': \(3,\)\}"):
         explain_gradient(lambda p: {"a": p}, jnp.ones(3))
+
+
+def test_an_operation_inside_a_librarys_compiled_function_has_its_callers_place():
+    flow = jnp.zeros((4, 3))
+    jnp.linalg.norm(flow, axis=-1)  # now JAX has its program, and no longer says who asked for it
+    found = explain_gradient(lambda f: {"length": jnp.mean(jnp.linalg.norm(f, axis=-1))}, flow)
+    assert found.groups == ("all",) and "test_testing.py" in found.origin.where

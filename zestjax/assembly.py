@@ -92,8 +92,11 @@ def _compared(places, frame, exclude):
 
 
 def dequantised(evidence):
-    """uint8 `Evidence` as float32 in [0, 1]."""
-    return jax.tree.map(lambda x: x.astype(jnp.float32) / 255, evidence)
+    """uint8 `Evidence` as float32 in [0, 1].
+
+    A product: compiled, a division by a constant becomes one too, and would round otherwise than uncompiled.
+    """
+    return jax.tree.map(lambda x: x.astype(jnp.float32) * np.float32(1 / 255), evidence)
 
 
 def target_inputs(images, cameras, near, far, camera, time, *, config, exclude=()):

@@ -9,9 +9,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax._src import source_info_util
 
-from zestjax.testing.walk import program, run
+from zestjax.testing.walk import place_of, program, run
 
 
 class Origin(NamedTuple):
@@ -68,7 +67,7 @@ def explain_gradient(losses, params, *, depth=1):
     if not shapes or any(x.shape != () for x in shapes.values()):
         got = {name: x.shape for name, x in shapes.items()}
         raise ValueError(f"explain_gradient: `losses` should give scalars by name, got {got}.")
-    paths = [jax.tree_util.keystr(p[:depth]) for p, _ in jax.tree_util.tree_leaves_with_path(params)]
+    paths = [jax.tree_util.keystr(p[:depth]) or "all" for p, _ in jax.tree_util.tree_leaves_with_path(params)]
     groups, values, norms, origin = tuple(dict.fromkeys(paths)), [], [], None
     for term in shapes:
         value, grads = jax.jit(jax.value_and_grad(lambda p, term=term: named(p)[term]))(params)
@@ -100,7 +99,7 @@ def _origin(loss, params, term):
         run(closed, leaves, visit)
         if found:
             equation, outputs = found[0]
-            where = source_info_util.summarize(equation.source_info)
+            where = place_of(equation)
             return Origin(term, equation.primitive.name, where, tuple(outputs[0].shape), stage)
     return None
 

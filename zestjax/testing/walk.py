@@ -6,6 +6,7 @@ visit      `visit(equation, inputs, outputs) -> outputs`, called for every primi
 
 import jax
 import jax.numpy as jnp
+from jax._src import source_info_util
 from jax.extend.core import ClosedJaxpr, Literal
 
 INNER = ("jaxpr", "call_jaxpr", "fun_jaxpr")
@@ -55,12 +56,23 @@ def _outputs(equation, inputs, visit):
     name, inner = equation.primitive.name, _inner(equation)
     if name in INLINED and inner:
         consts = inner[0].consts if isinstance(inner[0], ClosedJaxpr) else ()
-        return _run(_jaxpr(inner[0]), consts, inputs, visit)
+        within = lambda inside, inputs, outputs: visit(_placed(inside, equation), inputs, outputs)
+        return _run(_jaxpr(inner[0]), consts, inputs, within)
     if name == "scan":
         return _scan(equation.params, inputs, visit)
     outputs = equation.primitive.bind(*inputs, **equation.params)
     outputs = list(outputs) if equation.primitive.multiple_results else [outputs]
     return visit(equation, inputs, outputs)
+
+
+def place_of(equation):
+    """File, line and function that asked for an operation; empty where JAX has not kept them."""
+    return source_info_util.summarize(equation.source_info)
+
+
+def _placed(equation, caller):
+    """An operation of a function that was compiled before has no place of its own: it has its caller's."""
+    return equation if place_of(equation) else equation.replace(source_info=caller.source_info)
 
 
 def _scan(params, inputs, visit):
