@@ -12,7 +12,7 @@ FAST = XLA_FLAGS=--xla_backend_optimization_level=1
 TEST_ENV = PJRT_NPROC=1 OMP_NUM_THREADS=1 MPLBACKEND=Agg
 PYTEST = $(TEST_ENV) $(RUN) -m pytest -q -n $(WORKERS) --dist loadfile
 
-.PHONY: test lint demo bench mutations test-slow test-lowest test-newest clean
+.PHONY: test lint demo bench mutations stability precision notebooks test-slow test-lowest test-newest clean
 
 $(VENV)/installed: pyproject.toml
 	@test -n "$(PYTHON)" || { echo "error: no Python 3.11-3.13 with venv found; pass PYTHON=/path/to/python" >&2; exit 2; }
@@ -39,6 +39,21 @@ bench: $(VENV)/installed
 # Undo one guard of the numeric core at a time: some test must fail.
 mutations: $(VENV)/installed
 	$(TEST_ENV) $(RUN) experiments/mutations.py
+
+# 2,000 steps of `tiny` over nasty scenes, with either set of losses and with half-precision networks.
+stability: $(VENV)/installed
+	$(RUN) experiments/stability.py --out runs/stability/frames
+	$(RUN) experiments/stability.py --out runs/stability/paper --losses paper
+	$(RUN) experiments/stability.py --out runs/stability/half --precision bfloat16
+
+# What float32, bfloat16 networks and float64 cost and give up, on the same weights.
+precision: $(VENV)/installed
+	$(RUN) experiments/precision.py --out runs/precision
+
+# Run the notebooks and write experiments/notebooks/rendered/.
+notebooks: $(VENV)/installed
+	$(RUN) -m pip install -q -e '.[notebooks]'
+	$(FAST) $(RUN) experiments/notebooks/build.py
 
 test-slow: $(VENV)/installed
 	$(PYTEST) -m slow

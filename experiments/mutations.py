@@ -17,8 +17,10 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 MUTATIONS = {
     "numerics": [
-        ("jnp.sqrt(jnp.where(positive, squared, 1))", "jnp.sqrt(squared)"),
-        ("numerator / jnp.where(zero, 1, denominator)", "numerator / denominator"),
+        ("jnp.sqrt(jnp.where(positive, x, 1))", "jnp.sqrt(x)"),
+        ("_quotient(numerator, jnp.where(zero, 1, denominator))", "_quotient(numerator, denominator)"),
+        ("(tangents[0] - quotient * tangents[1]) / primals[1]",
+         "tangents[0] / primals[1] - primals[0] * tangents[1] / primals[1] ** 2"),
         ("jnp.sum(jnp.where(mask > 0, x, 0) * mask)", "jnp.sum(x * mask)"),
         ("/ jnp.where(count > 0, count, 1)", "/ count"),
         ("jnp.concatenate([zero, jnp.cumsum(x[..., :-1], axis=-1)], axis=-1)", "jnp.cumsum(x, axis=-1) - x"),
@@ -87,6 +89,7 @@ MUTATIONS = {
         ("flow - jnp.where(known[..., None], truth, 0)", "flow - truth"),
     ],
     "adam": [
+        ("safe_sqrt(debiased(square, b2))", "jnp.sqrt(debiased(square, b2))"),
         ("keep = lambda new, old: jnp.where(good, new, old)", "keep = lambda new, old: new"),
         ("clip_norm / jnp.maximum(norm, clip_norm)", "clip_norm / norm"),
     ],

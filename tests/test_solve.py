@@ -181,3 +181,18 @@ def test_unknown_solver_options_list_the_known_ones():
         solve.fit_lbfgs(OBJECTIVE, START, DATA, WEIGHTS, linesearch="wolfe")
     with pytest.raises(ValueError, match="'levenberg_marquardt', 'gauss_newton'"):
         solve.fit_least_squares(lambda p: p["w"], START, method="newton")
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-25, 1.0])
+def test_an_update_can_be_differentiated_also_where_a_parameter_has_no_gradient(value):
+    """Of a loss after a step, in a weight of the loss: parameters that nothing pulls at have a second moment of 0."""
+    params = {"pulled": jnp.array([1.0, 2.0]), "not pulled": jnp.zeros(3)}
+
+    def after(weight):
+        grads = {"pulled": weight * params["pulled"], "not pulled": weight * jnp.full(3, value)}
+        solver = solve.Adam(clip_norm=1.0)
+        stepped, _ = solver.apply(params, solver.init_state(params), grads, weight)
+        return sum(jnp.sum(x**2) for x in jax.tree.leaves(stepped))
+
+    for slope in (jax.jacfwd(after), jax.jacrev(after)):
+        assert np.isfinite(slope(jnp.float32(0.5)))

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.numerics import safe_sqrt
 from zestjax.trees import all_finite, tree_cast, tree_norm
 
 
@@ -91,7 +92,7 @@ def adam(params, state, grads, value, *, rate, b1=0.9, b2=0.999, eps=1e-8, clip_
         g = cast(g) * cast(scale)
         mean, square = b1 * m + (1 - b1) * g, b2 * v + (1 - b2) * g**2
         debiased = lambda x, b: x / (1 - cast(b) ** cast(count))
-        change = cast(rate) * debiased(mean, b1) / (jnp.sqrt(debiased(square, b2)) + eps)
+        change = cast(rate) * debiased(mean, b1) / (safe_sqrt(debiased(square, b2)) + eps)
         keep = lambda new, old: jnp.where(good, new, old)
         return keep((cast(p) - change).astype(p.dtype), p), keep(mean, m), keep(square, v)
 

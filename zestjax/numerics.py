@@ -25,11 +25,15 @@ def exclusive_cumprod(x):
     return jnp.cumprod(jnp.concatenate([ones, x[..., :-1]], axis=-1), axis=-1)
 
 
+def safe_sqrt(x):
+    """Square root of x >= 0 whose gradient at 0 is 0 rather than infinite."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+
+
 def safe_norm(x, *, axis=-1, keepdims=False):
     """Euclidean norm whose gradient at x = 0 is 0 rather than NaN."""
-    squared = jnp.sum(x * x, axis=axis, keepdims=keepdims)
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+    return safe_sqrt(jnp.sum(x * x, axis=axis, keepdims=keepdims))
 
 
 def safe_divide(numerator, denominator, *, otherwise=0.0):

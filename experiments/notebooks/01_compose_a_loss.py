@@ -40,8 +40,8 @@ f"{len(clip.images)} frames of {config.height} x {config.width}; a batch is {len
 # %% [markdown]
 # ## From parameters to a prediction
 #
-# Three steps: what each frame says about itself, the volumes of the target, the rays. All are pure functions of arrays,
-# so the whole is one: `predict` can be compiled, differentiated and mapped.
+# Three steps: what each frame says about itself, the volumes of the target, the rays. All are pure functions of
+# arrays, so the whole is one: `predict` can be compiled, differentiated and mapped.
 
 
 # %%
@@ -58,9 +58,9 @@ prediction = jax.jit(lambda p, b: predict(p, b)[0])(params, batches[0])
 # %% [markdown]
 # ## A loss of our own
 #
-# Squared colour errors forgive blur. A batch is whole rows of the target, so neighbouring rays are neighbouring pixels,
-# and we can ask that colours *change* from pixel to pixel as they do in the truth. The first attempt takes the length of
-# the difference of the two changes, with NumPy's norm.
+# Squared colour errors forgive blur. A batch is whole rows of the target, so neighbouring rays are neighbouring
+# pixels, and we can ask that colours *change* from pixel to pixel as they do in the truth. The first attempt takes
+# the length of the difference of the two changes, with NumPy's norm.
 
 
 # %%
@@ -80,16 +80,16 @@ except AssertionError as error:
     print(error)
 
 # %% [markdown]
-# `assert_finite` looks at the value and at every gradient: where the rendered change equals the true one, the norm is 0
-# and its slope 0 / 0. In training this strikes at the first flat region that is rendered exactly. `explain_gradient`
-# says where it comes from.
+# `assert_finite` looks at the value and at every gradient: where the rendered change equals the true one, the norm is
+# 0 and its slope 0 / 0. In training this strikes at the first flat region that is rendered exactly.
+# `explain_gradient` says where it comes from.
 
 # %%
 print(explain_gradient(lambda c: {"edge": naive_edge_loss(c, target)}, target))
 
 # %% [markdown]
-# `numerics.safe_norm` has slope 0 there. `mean_over_valid` is how every loss in the library averages: what a mask leaves
-# out may even be NaN. The two checks below are all it takes: finite, and the gradient is the slope.
+# `numerics.safe_norm` has slope 0 there. `mean_over_valid` is how every loss in the library averages: what a mask
+# leaves out may even be NaN. The two checks below are all it takes: finite, and the gradient is the slope.
 
 
 # %%
@@ -169,7 +169,9 @@ for edge_weight in (0.0, 2.0):
     print(f"weight {edge_weight}: PSNR {score:.2f} dB, edge loss {edges:.4f}, {1e3 * seconds:.0f} ms a step")
 
 # %%
-images = [np.asarray(x).reshape(config.crop_rows, config.width, 3).clip(0, 1) for x in (rows[0][4], rows[1][4], truths[0])]
+images = [
+    np.asarray(x).reshape(config.crop_rows, config.width, 3).clip(0, 1) for x in (rows[0][4], rows[1][4], truths[0])
+]
 figure, axes = plt.subplots(3, 1, figsize=(6, 3.6), dpi=80)
 for axis, image, title in zip(axes, images, ("weight 0", "weight 2", "truth"), strict=True):
     axis.imshow(image)
@@ -177,5 +179,5 @@ for axis, image, title in zip(axes, images, ("weight 0", "weight 2", "truth"), s
     axis.axis("off")
 
 # %% [markdown]
-# The loss is cheap beside the volumes, and changes from pixel to pixel come nearer to the truth's. Whether the picture
-# is better for it is for the pictures, and for the scores on scenes of your own, to say.
+# The loss is cheap beside the volumes, and changes from pixel to pixel come nearer to the truth's. Whether the
+# picture is better for it is for the pictures, and for the scores on scenes of your own, to say.

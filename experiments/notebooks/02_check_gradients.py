@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Is the gradient the slope?
 #
-# The loss of the full model goes through warps, volumes, sampled surfaces, compositing and networks. Here its gradient is
-# compared with finite differences, and the error is plotted against the step: the shape of the curve tells a wrong
-# gradient from rounding, and from a kink.
+# The loss of the full model goes through warps, volumes, sampled surfaces, compositing and networks. Here its
+# gradient is compared with finite differences, and the error is plotted against the step: the shape of the curve
+# tells a wrong gradient from rounding, and from a kink.
 
 # %%
 import functools
@@ -39,9 +39,9 @@ params = init_params(jax.random.key(1), config)
 # %% [markdown]
 # ## What a correct gradient looks like
 #
-# Start with one function: the weights of samples along a ray. A central difference errs by the square of the step, and
-# by the rounding of the function divided by the step. The first shrinks with the step, the second grows, and between
-# them lies a valley whose floor is as deep as the precision allows.
+# Start with one function: the weights of samples along a ray. A central difference errs by the square of the step,
+# and by the rounding of the function divided by the step. The first shrinks with the step, the second grows, and
+# between them lies a valley whose floor is as deep as the precision allows.
 
 # %%
 STEPS = np.logspace(-9, -0.5, 35)
@@ -81,16 +81,16 @@ def plot(curves, title):
 plot(curves, "weights along a ray")
 
 # %% [markdown]
-# In float32 the valley bottoms out near 1e-5: no check in float32 can tell a gradient that is wrong by 1e-5 from a right
-# one. In float64 it reaches 1e-10. That is why `assert_grads_match` raises everything to float64 for the check, whatever
-# the precision you work in.
+# In float32 the valley bottoms out near 1e-5: no check in float32 can tell a gradient that is wrong by 1e-5 from a
+# right one. In float64 it reaches 1e-10. That is why `assert_grads_match` raises everything to float64 for the check,
+# whatever the precision you work in.
 #
 # ## The full model
 #
 # The same for the loss of a whole training step in all of its parameters, along one random direction. Guides, trusted
-# maps and the places where neighbours are looked at are held on purpose (`stop_gradient`): moving them is not part of the
-# gradient. A plain finite difference moves them all the same, and disagrees. So the check must hold them too, which is
-# what `zestjax.testing.held` does: it records what passes a `stop_gradient` once and plays it back.
+# maps and the places where neighbours are looked at are held on purpose (`stop_gradient`): moving them is not part of
+# the gradient. A plain finite difference moves them all the same, and disagrees. So the check must hold them too,
+# which is what `zestjax.testing.held` does: it records what passes a `stop_gradient` once and plays it back.
 
 # %%
 WEIGHTS = Terms(rec=1.0, static_rec=1.0, b=1e-2)
@@ -117,8 +117,8 @@ print({name: f"{curve.min():.1e}" for name, curve in curves.items()})
 
 # %% [markdown]
 # Held, the curve falls as a valley should: the gradient is the slope. Not held, it stays at a plateau: that is not an
-# error of the gradient but the effect of what was stopped. To the right both curves rise where the step passes kinks (the
-# corners of leaky ReLUs and of clipped values), to the left rounding takes over.
+# error of the gradient but the effect of what was stopped. To the right both curves rise where the step passes kinks
+# (the corners of leaky ReLUs and of clipped values), to the left rounding takes over.
 #
 # In one line, for any loss over any pytree:
 
@@ -130,9 +130,9 @@ print("the gradient of the whole model is its slope")
 # %% [markdown]
 # ## When it is not
 #
-# A gradient can be finite and wrong, or right and not finite. The first shows in the plot; here is the second. The length
-# of a flow that is exactly 0 has no slope: `jnp.linalg.norm` answers NaN, and one NaN spoils every parameter that the
-# loss reaches. `explain_gradient` names the operation and the line.
+# A gradient can be finite and wrong, or right and not finite. The first shows in the plot; here is the second. The
+# length of a flow that is exactly 0 has no slope: `jnp.linalg.norm` answers NaN, and one NaN spoils every parameter
+# that the loss reaches. `explain_gradient` names the operation and the line.
 
 
 # %%
@@ -143,9 +143,9 @@ def flow_lengths(flow):
 print(explain_gradient(flow_lengths, jnp.zeros((4, 3))))
 
 # %% [markdown]
-# In a training run the same question is asked for you: a step whose gradient is not finite is skipped, and the log names
-# the loss, the target frame and the parameters (`learn.find_fault`). The training gradient itself, which is summed block
-# by block over rays, agrees with the plain one above:
+# In a training run the same question is asked for you: a step whose gradient is not finite is skipped, and the log
+# names the loss, the target frame and the parameters (`learn.find_fault`). The training gradient itself, which is
+# summed block by block over rays, agrees with the plain one above:
 
 # %%
 blocked, terms, value = jax.jit(step_gradients(config, weights=WEIGHTS))(params, batch)
