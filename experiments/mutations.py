@@ -28,8 +28,8 @@ MUTATIONS = {
     "cameras": [("/ jnp.where(in_front, depth, 1)[..., None]", "/ depth[..., None]")],
     "rendering": [
         ("return -jnp.expm1(-thickness)", "return (1 - jnp.exp(-thickness))"),
-        ("return -jnp.expm1(-density * jnp.broadcast_to(lengths, density.shape))",
-         "return 1 - jnp.exp(-density * jnp.broadcast_to(lengths, density.shape))"),
+        ("return -jnp.expm1(-jnp.multiply(*jnp.broadcast_arrays(density, lengths)))",
+         "return 1 - jnp.exp(-jnp.multiply(*jnp.broadcast_arrays(density, lengths)))"),
         ("exclusive_cumprod((1 - static) * (1 - dynamic))",
          "jnp.exp(exclusive_cumsum(jnp.log((1 - static) * (1 - dynamic))))"),
         ("jax.lax.stop_gradient(weights) if hold_weights else weights", "weights"),

@@ -14,16 +14,21 @@ FILES = sorted((ROOT / "zestjax").rglob("*.py"))
 TOP_LEVEL = {"zestjax", "experiments", "tests", "pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "Makefile"}
 
 
+def of_experiments(name):
+    """A script of `experiments/` as a module."""
+    sys.path.insert(0, str(ROOT / "experiments"))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.pop(0)
+
+
 def test_optax_is_not_in_the_environment():
     assert importlib.util.find_spec("optax") is None
 
 
 def test_every_dependency_states_its_lower_bound():
-    sys.path.insert(0, str(ROOT / "experiments"))
-    try:
-        lower_bounds = importlib.import_module("lower_bounds").lower_bounds
-    finally:
-        sys.path.pop(0)
+    lower_bounds = of_experiments("lower_bounds").lower_bounds
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert any(line.startswith("jaxopt==0.8.5") for line in lower_bounds(project))
 
@@ -64,3 +69,9 @@ def test_only_the_edge_prints_or_reads_arguments(path):
             assert node.func.id != "print"
         if isinstance(node, ast.Import):
             assert not {"argparse", "logging", "tqdm"} & {alias.name for alias in node.names}
+
+
+def test_every_guard_that_the_mutation_check_undoes_is_still_there():
+    source = lambda module: (ROOT / "zestjax" / f"{module}.py").read_text()
+    listed = of_experiments("mutations").MUTATIONS
+    assert not [guard for name, pairs in listed.items() for guard, _ in pairs if guard not in source(name)]

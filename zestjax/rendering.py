@@ -88,8 +88,7 @@ def alpha_from_density(density, lengths):
       ValueError: if the sample axes differ.
     """
     check_shapes("alpha_from_density", density=(density, "... S"), lengths=(lengths, "... S"))
-    density, lengths = jnp.broadcast_arrays(density, lengths)
-    return -jnp.expm1(-density * lengths)
+    return -jnp.expm1(-jnp.multiply(*jnp.broadcast_arrays(density, lengths)))
 
 
 def weights_from_density(density, lengths):
@@ -114,8 +113,7 @@ def weights_from_density(density, lengths):
     agree to 2e-7 in float32 for S <= 128. The paper's print leaves the lengths out.
     """
     check_shapes("weights_from_density", density=(density, "... S"), lengths=(lengths, "... S"))
-    density, lengths = jnp.broadcast_arrays(density, lengths)
-    thickness = density * lengths
+    thickness = jnp.multiply(*jnp.broadcast_arrays(density, lengths))
     return -jnp.expm1(-thickness) * jnp.exp(-exclusive_cumsum(thickness))
 
 
