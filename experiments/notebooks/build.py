@@ -28,13 +28,18 @@ def rendered(path):
     NotebookClient(notebook, timeout=LIMIT, resources={"metadata": {"path": str(path.parent)}}).execute()
     seconds = time.perf_counter() - start
     for cell in notebook.cells:
-        # What is printed to the error stream, progress bars and warnings, is not for reading.
-        cell["outputs"] = [o for o in cell.get("outputs", []) if o.get("name") != "stderr"]
+        cell["outputs"] = [o for o in cell.get("outputs", []) if for_reading(o)]
     text, resources = MarkdownExporter().from_notebook_node(notebook)
     figures = {f"{path.stem}_{name}": content for name, content in resources.get("outputs", {}).items()}
     for name in resources.get("outputs", {}):
         text = text.replace(f"({name})", f"({path.stem}_{name})")
     return text, figures, seconds
+
+
+def for_reading(output):
+    """Not progress bars and warnings, nor where in memory a plot's legend lies."""
+    shown = output.get("data", {})
+    return output.get("name") != "stderr" and ("image/png" in shown or " at 0x" not in shown.get("text/plain", ""))
 
 
 def main():
