@@ -4,6 +4,7 @@ H W      16 x 24 unless a test says otherwise; the focal length is W
 x t      a camera looks along z from (x, 0, 0); the card's left edge is at t / 10 - 0.4, world units
 """
 
+import collections
 import dataclasses
 import functools
 
@@ -175,19 +176,16 @@ def pixels():
     return pixel_grid(*SIZE).reshape(-1, 2)[::6]
 
 
+def equations(program):
+    """Every equation of a program, those of inner programs too, each once."""
+    inner_program = lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")
+    for equation in getattr(program, "jaxpr", program).eqns:
+        yield equation
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=inner_program):
+            if inner_program(inner):
+                yield from equations(inner)
+
+
 def operations(fn, *args):
     """How many primitives a function's program holds, by name; inner programs counted once."""
-    count = {}
-
-    def walk(jaxpr):
-        for equation in jaxpr.eqns:
-            count[equation.primitive.name] = count.get(equation.primitive.name, 0) + 1
-            for inner in jax.tree.leaves(
-                list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")
-            ):
-                inner = getattr(inner, "jaxpr", inner)
-                if hasattr(inner, "eqns"):
-                    walk(inner)
-
-    walk(jax.make_jaxpr(fn)(*args).jaxpr)
-    return count
+    return collections.Counter(equation.primitive.name for equation in equations(jax.make_jaxpr(fn)(*args)))

@@ -71,20 +71,9 @@ def test_only_networks_are_in_half_precision():
 
 def contains_half(closed, name):
     """Whether an operation of that name has a bfloat16 result, anywhere in a program."""
-    return any(v.aval.dtype == jnp.bfloat16 for e in equations(closed) if e.primitive.name == name for v in e.outvars)
-
-
-def equations(closed):
-    """Every equation of a program, those of inner programs too."""
-    for equation in getattr(closed, "jaxpr", closed).eqns:
-        yield equation
-        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=is_program):
-            if is_program(inner):
-                yield from equations(inner)
-
-
-def is_program(x):
-    return hasattr(x, "eqns") or hasattr(x, "jaxpr")
+    return any(
+        v.aval.dtype == jnp.bfloat16 for e in stage.equations(closed) if e.primitive.name == name for v in e.outvars
+    )
 
 
 K = jnp.asarray([[40.0, 0, 8], [0, 40, 6], [0, 0, 1]])
@@ -107,7 +96,7 @@ GEOMETRY = {
 def test_no_product_of_the_geometry_may_run_in_tf32(name):
     """A GPU multiplies float32 matrices in TF32 unless told otherwise: every product here is told."""
     closed, _, _ = program(GEOMETRY[name], uniform(0, 3, 3, low=1, high=2))
-    products = [e.params["precision"] for e in equations(closed) if e.primitive.name == "dot_general"]
+    products = [e.params["precision"] for e in stage.equations(closed) if e.primitive.name == "dot_general"]
     highest = jax.lax.Precision.HIGHEST
     assert all(p == (highest, highest) for p in products), products
 

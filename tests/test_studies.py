@@ -23,7 +23,7 @@ def run(*command, limit):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_as_a_script(path):
-    run(path, limit=300)
+    assert run(path, limit=300)  # each prints what it finds
 
 
 @pytest.mark.parametrize("losses", ["frames", "paper"])

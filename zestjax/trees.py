@@ -6,6 +6,8 @@ A leaf's name is its path as Python writes it: `.trunk[0].kernel`.
 import jax
 import jax.numpy as jnp
 
+from zestjax.numerics import safe_sqrt
+
 
 def leaf_names(tree):
     """Names of the leaves, in the order of `jax.tree.leaves`."""
@@ -23,8 +25,7 @@ def tree_norm(tree):
     largest = jax.lax.stop_gradient(jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in leaves])))
     scale = jnp.where(largest > 0, largest, 1)
     squared = sum(jnp.vdot(leaf / scale, leaf / scale, precision=jax.lax.Precision.HIGHEST) for leaf in leaves)
-    positive = squared > 0
-    return jnp.where(positive, scale * jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+    return scale * safe_sqrt(squared)
 
 
 def tree_cast(tree, dtype):

@@ -6,6 +6,7 @@ takes longer than it may. Needs the extra `notebooks`: `make notebooks` installs
 """
 
 import argparse
+import re
 import sys
 import time
 from pathlib import Path
@@ -30,6 +31,7 @@ def rendered(path):
     for cell in notebook.cells:
         cell["outputs"] = [o for o in cell.get("outputs", []) if for_reading(o)]
     text, resources = MarkdownExporter().from_notebook_node(notebook)
+    text = re.sub(r"/\S*/ipykernel_\d+/\d+\.py:(\d+)(:\d+)?", r"line \1 of its cell", text)
     figures = {f"{path.stem}_{name}": content for name, content in resources.get("outputs", {}).items()}
     for name in resources.get("outputs", {}):
         text = text.replace(f"({name})", f"({path.stem}_{name})")
