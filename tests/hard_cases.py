@@ -286,6 +286,8 @@ CASES = [
     Case("aligning a constant", "a variance of 0", lambda v: depth.aligned(
         depth.align_least_squares(v, like(v, RAY), jnp.ones_like(v)), v), (ONES,), np.full(4, 1.4)),
     Case("the norm of 0", "a square root at 0", numerics.safe_norm, (np.zeros(3, np.float32),), 0.0),
+    Case("a quotient of small numbers", "the square of the denominator is 0", numerics.safe_divide,
+         (array(1e-25, 3e-25), array(2e-25, 1e-25)), array(0.5, 3)),
     Case("dividing by 0", "inf", numerics.safe_divide, (RAY, EMPTY), np.zeros(4)),
     # networks
     Case("a batch of constants", "a deviation of 0", normed, (np.full((5, 2), 3.0, np.float32),), np.zeros((5, 2))),
