@@ -148,7 +148,7 @@ def fit_lbfgs(objective, params, batch, weights, *, max_steps=100, tol=1e-4, his
       max_steps: stop after this many.
       tol: stop at this L2 gradient norm.
       history: gradients kept; memory is 2 * history times the params.
-      linesearch: "backtracking" (compiles fast), "zoom" or "hager-zhang".
+      linesearch: "backtracking", "zoom" or "hager-zhang".
 
     Returns:
       `Fit`. Running out of steps is reported in `converged`, not raised: a raise cannot cross `vmap`.
