@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,7 +11,10 @@ import time
 import numpy as np
 import pytest
 
+from zestjax.io.nsff import read_nsff
 from zestjax.io.weights import load_weights
+
+NOT_SECOND = (1, *range(3, 13))  # the second camera took frame 1
 
 pytestmark = pytest.mark.slow
 
@@ -80,6 +84,17 @@ def test_stages_follow_one_another_and_real_scenes_serve_too(place, weights, sce
 def test_the_log_has_every_loss_term(place, weights):
     line = json.loads((weights.parent / "log.jsonl").read_text().splitlines()[-1])
     assert {"step", "seconds", "seconds_per_step", "total", "rec"} <= line.keys() and line["step"] == 12
+
+
+def test_a_simulated_folder_is_numbered_as_published_and_needs_no_truth_for_its_poses(scene, tmp_path):
+    assert [p.name for p in sorted((scene / "mv_images/00001").iterdir())] == [f"cam{i:02d}.png" for i in NOT_SECOND]
+    assert {p.name for p in (scene / "truth").glob("00001_*")} == {f"00001_cam{i:02d}.npz" for i in NOT_SECOND}
+    bare = shutil.copytree(scene, tmp_path / "bare", ignore=shutil.ignore_patterns("truth", "scene.json"))
+    told, known = read_nsff(bare).held_out, {(t.time, t.camera_name): t.camera for t in read_nsff(scene).held_out}
+    assert len(told) == 6 * 5  # cameras 7 to 12 took none of the six frames
+    for target in told:
+        expected = known[target.time, target.camera_name].camera_from_world
+        np.testing.assert_allclose(target.camera.camera_from_world, expected, atol=1e-5)
 
 
 def test_a_simulated_folder_is_evaluated_rendered_and_learned_from(place, weights, scene):

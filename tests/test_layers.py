@@ -9,7 +9,7 @@ import zestjax
 
 PACKAGE = Path(zestjax.__file__).parent
 LAYERS = [
-    "numerics checks trees",
+    "backend numerics checks trees",
     "cameras video rays resample frustum",
     "nets planesweep plane_statistics selection trust cost_volume optical_flow evidence analysis encoding",
     "fields",

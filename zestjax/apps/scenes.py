@@ -85,7 +85,7 @@ def target_from_answers(shown, i, camera, protocol):
     time, view = int(shown.times[i]), host_camera(*(np.asarray(leaf)[i] for leaf in shown.cameras))
     return Target(
         time=time,
-        camera_name="input" if protocol != "held-out" else f"cam{camera:02d}",
+        camera_name="input" if protocol != "held-out" else f"cam{camera + 1:02d}",  # numbered as published
         camera=view,
         image=shown.images[i],
         dynamic=shown.moving[i],

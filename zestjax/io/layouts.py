@@ -6,8 +6,9 @@ lists them and does the rest, the same way for all.
     native size   (height, width) in which the record's cameras count pixels; pictures may be stored in another
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,19 @@ class HeldOut:
     truth: Path | None = None
 
 
+class Later(Sequence):
+    """Held-out pictures that are looked for when they are first asked for: only one protocol needs them."""
+
+    def __init__(self, find: Callable[[], Iterable[HeldOut]]):
+        self._found = cache(lambda: tuple(find()))
+
+    def __len__(self):
+        return len(self._found())
+
+    def __getitem__(self, index):
+        return self._found()[index]
+
+
 @dataclass(frozen=True)
 class Record:
     """A scene on disk.
@@ -54,7 +68,7 @@ class Record:
     flow_forward: Mapping[int, Path] = field(default_factory=dict)
     flow_backward: Mapping[int, Path] = field(default_factory=dict)
     truth: Mapping[int, Path] = field(default_factory=dict)
-    held_out: tuple[HeldOut, ...] = ()
+    held_out: Sequence[HeldOut] = ()
     reserved: tuple[int, ...] = ()
 
 

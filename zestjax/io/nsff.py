@@ -4,14 +4,15 @@ Under the scene's folder, or `dense/` in it:
 
     poses_bounds.npy            (N, 17): 3 x 5 [down right back position | height width focal], near, far
     images/                     N pictures, sorted by name (or images_<W>x<H>/, or images_<factor>/ as LLFF has)
-    mv_images/00000/cam00.png   what every camera of the rig saw at a time; frame i was taken by camera i mod rig
-    mv_masks/00000/cam00.png    their moving pixels
+    mv_images/00000/cam01.png   what every camera of the rig saw at a time; frame i was taken by camera i mod rig, and
+                                camera c is cam01 and so on as published: `zestjax.io.rig` reads other numberings too
+    mv_masks/00000/cam01.png    their moving pixels
     motion_masks/00000.png      moving pixels of the frames
     disp/00000.npy              (H, W) disparity, up to scale and shift (an inverse depth when simulated)
     flow_i1/00000_fwd.npz       `flow` (H, W, 2) pixels and `mask` (H, W) towards the next frame; `_bwd` the previous;
                                 or 00000_fwd.flo
 
-and, where the truth is known, `truth/00000.npz` by frame and `truth/00000_cam00.npz` by held-out picture (`depth`,
+and, where the truth is known, `truth/00000.npz` by frame and `truth/00000_cam02.npz` by held-out picture (`depth`,
 `flow`, and its camera), with `scene.json` for the name and the exact depth bounds.
 """
 
@@ -22,8 +23,9 @@ import numpy as np
 
 from zestjax.cameras import Camera, camera_from_llff_pose
 from zestjax.io.files import replaced_folder
-from zestjax.io.layouts import HeldOut, Record, bounds_from_frames, pictures_in, select
+from zestjax.io.layouts import HeldOut, Later, Record, bounds_from_frames, pictures_in, select
 from zestjax.io.pictures import write_image
+from zestjax.io.rig import find_rig, numbered, targets_of
 
 MARKER = "poses_bounds.npy"
 
@@ -72,7 +74,7 @@ def read_nsff(path):
         flow_forward=_flows(root, "fwd"),
         flow_backward=_flows(root, "bwd"),
         truth={i: p for i in range(len(rows)) if (p := root / f"truth/{i:05d}.npz").is_file()},
-        held_out=tuple(_held_out(root, cameras)),
+        held_out=Later(lambda: _held_out(root, images, cameras)),
     )
 
 
@@ -182,27 +184,29 @@ def _flows(root, direction):
     return {int(match[1]): path for match, path in matches if match}
 
 
-def _held_out(root, cameras):
-    """Pictures of other cameras at each time, by time and name."""
-    count = len(cameras.intrinsics)
+def _held_out(root, images, cameras):
+    """Pictures of other cameras at each time, by time and name.
+
+    A picture's camera is that of its truth file; without one, that of a frame which the same camera took.
+    """
     by_time = {int(p.name): pictures_in(p) for p in sorted((root / "mv_images").glob("*")) if p.name.isdigit()}
-    rig = len({_number(file) for files in by_time.values() for file in files})
-    for time, files in sorted(by_time.items()):
-        for file in files if time < count else ():
-            number, mask = _number(file), root / f"mv_masks/{time:05d}/{file.stem}.png"
-            truth = root / f"truth/{time:05d}_{file.stem}.npz"
-            camera = _camera_of(truth) if truth.is_file() else None
-            if number is None or (camera is None and (number == time % rig or number >= count)):
-                continue  # the frame's own camera, or one whose pose no frame tells
-            camera = select(cameras, number) if camera is None else camera
-            yield HeldOut(
-                time, file.stem, camera, file, mask if mask.is_file() else None, truth if truth.is_file() else None
-            )
+    files = [(time, file) for time, files in sorted(by_time.items()) if time < len(images) for file in files]
+    truths = {entry: truth for entry in files if (truth := _truth_of(root, *entry)).is_file()}
+    known = {entry: camera for entry, truth in truths.items() if (camera := _camera_of(truth)) is not None}
+    if len(known) < len(files):
+        pictures = numbered(by_time)
+        rig = find_rig(root / "mv_images", images, pictures)
+        told = {(time, pictures[time][number]): place for time, number, place in targets_of(rig, pictures, len(images))}
+        known = {entry: select(cameras, place) for entry, place in told.items()} | known
+    for time, file in files:
+        if (time, file) in known:
+            mask = root / f"mv_masks/{time:05d}/{file.stem}.png"
+            mask, truth = mask if mask.is_file() else None, truths.get((time, file))
+            yield HeldOut(time, file.stem, known[time, file], file, mask, truth)
 
 
-def _number(file):
-    digits = re.findall(r"\d+", file.stem)
-    return int(digits[-1]) if digits else None
+def _truth_of(root, time, file):
+    return root / f"truth/{time:05d}_{file.stem}.npz"
 
 
 def _camera_of(truth):

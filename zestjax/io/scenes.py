@@ -112,7 +112,8 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
       protocol: `held-out`, `strict` or `paper`; see above.
       targets: which times to predict, as frame indices; `(time, camera name)` pairs choose single pictures; None for
         all.
-      exclude: frames whose pictures are not read; they are black.
+      exclude: frames whose pictures are not read; they are black. (With `held-out`, where poses must be told from
+        photographs, `zestjax.io.rig` looks at all.)
 
     Returns:
       `Scene`.

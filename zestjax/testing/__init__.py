@@ -5,16 +5,21 @@ They take any function over pytrees:
     assert_finite(loss, params)
     assert_grads_match(loss, params)
     print(explain_gradient(lambda p: {"mine": loss(p), "theirs": other(p)}, params))
+    check_backend()  # in a suite's conftest.py: does JAX compute what it should on this machine?
 """
 
+from zestjax.testing.backend import Check, backend_checks, check_backend
 from zestjax.testing.explain import Explanation, Origin, explain_gradient
 from zestjax.testing.gradients import assert_finite, assert_grads_match, held, value_and_gradients
 
 __all__ = [
+    "Check",
     "Explanation",
     "Origin",
     "assert_finite",
     "assert_grads_match",
+    "backend_checks",
+    "check_backend",
     "explain_gradient",
     "held",
     "value_and_gradients",
