@@ -7,8 +7,8 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 RUN = $(VENV)/bin/python
 # Two test workers on two cores: one XLA thread each, or they fight.
 WORKERS ?= 2
-# Level 1 halves the compiling, which is most of the suite's time; `make test-slow` runs what users run.
-FAST = XLA_FLAGS=--xla_backend_optimization_level=1
+# Compiling is most of the suite: tests/conftest.py makes it cheap. `make test-slow` compiles as users do.
+FAST = ZESTJAX_FAST_COMPILING=1
 TEST_ENV = PJRT_NPROC=1 OMP_NUM_THREADS=1 MPLBACKEND=Agg
 PYTEST = $(TEST_ENV) $(RUN) -m pytest -q -n $(WORKERS) --dist loadfile
 
@@ -53,7 +53,7 @@ precision: $(VENV)/installed
 # Run the notebooks and write experiments/notebooks/rendered/.
 notebooks: $(VENV)/installed
 	$(RUN) -m pip install -q -e '.[notebooks]'
-	$(FAST) $(RUN) experiments/notebooks/build.py
+	XLA_FLAGS=--xla_backend_optimization_level=1 $(RUN) experiments/notebooks/build.py
 
 test-slow: $(VENV)/installed
 	$(PYTEST) -m slow

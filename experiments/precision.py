@@ -35,7 +35,7 @@ def views(model, options):
     scores, colours, depths, seconds, compiling = [], [], [], [], []
     for name in options.scenes:
         scene = open_scene(f"bench:{name}", model.config, targets=options.times).scene
-        view_of = Renderer(model, scene.video)
+        view_of = Renderer(model, scene.video, steady=True)
         for target in scene.targets:
             view, took = view_of(target.camera, target.time)
             scores.append(score_image(view.colour, target.image, target.dynamic))

@@ -8,17 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stage
-from oracles import normal
+from oracles import adam_by_loop, normal
 from stage import MINI, PAPER, STILL
 
+from zestjax import learn
 from zestjax.analysis import FrameMaps
 from zestjax.batches import frame_batch
 from zestjax.encoding import Volume
 from zestjax.learn import (
     FRAME_WEIGHTS,
     MOVER_SHARE,
-    RAY_TERMS,
-    SCENE_TERMS,
     Fault,
     find_fault,
     frames_only,
@@ -28,7 +27,7 @@ from zestjax.learn import (
     train_step,
 )
 from zestjax.losses.objective import PAPER_WEIGHTS, Terms, measured, weighted_sum
-from zestjax.measures import make_measures
+from zestjax.measures import RAY_TERMS, SCENE_TERMS, make_measures, measurable
 
 
 class Caught:
@@ -140,7 +139,7 @@ def test_a_step_of_the_papers_system_with_all_its_losses_is_finite(change):
 
 def traced(config, weights):
     """Operations of a step's program."""
-    step = train_step(config, weights=weights, solver=Caught)
+    step = train_step(config, weights=measurable(config, weights), solver=Caught)
     return stage.operations(step, stage.params_of(config), None, stage.batch(config))
 
 
@@ -162,7 +161,8 @@ def test_a_static_scene_learns_without_a_dynamic_branch():
     assert total(traced(STILL, FRAME_WEIGHTS)) < 0.75 * total(traced(MINI, FRAME_WEIGHTS))
     out = jax.eval_shape(train_step(STILL, solver=Caught), stage.params_of(STILL), None, stage.batch(STILL))
     assert out[0].dynamic is None and out[0].motion is None
-    assert {n for n, v in out[2].items() if v is not None} == {"rec", "depth_ce", "frame_ce", "frame_mask", "total"}
+    learned = {"rec", "static_rec", "depth_ce", "frame_ce", "frame_mask", "total"}
+    assert {n for n, v in out[2].items() if v is not None} == learned
 
 
 @pytest.mark.parametrize("geometry, motion", [(True, False), (False, True), (False, False)])
@@ -170,7 +170,7 @@ def test_a_static_scene_learns_without_a_dynamic_branch():
 def test_every_ablation_has_a_step(base, geometry, motion):
     config = dataclasses.replace(base, geometry=geometry, motion=motion)
     weights = PAPER_WEIGHTS if base is PAPER else FRAME_WEIGHTS
-    step, params = train_step(config, weights=weights, solver=Caught), stage.params_of(config)
+    step, params = train_step(config, weights=measurable(config, weights), solver=Caught), stage.params_of(config)
     grads, _, terms = jax.eval_shape(step, params, None, stage.batch(base))
     assert jax.tree.structure(grads) == jax.tree.structure(params) and terms["rec"].shape == ()
 
@@ -223,11 +223,38 @@ def test_scene_terms_are_finite_with_finite_gradients(size):
     assert_all_finite(jax.jit(jax.value_and_grad(summed))(jnp.float32(size)))
 
 
-def test_the_compiled_step_keeps_its_schedule():
-    init, step = make_train_step(MINI, steps=10, weights=Terms(rec=1.0), warmup=2)
-    params = stage.params_of(MINI)
-    out = jax.eval_shape(step, params, init(params), stage.batch())
-    assert jax.tree.structure(out[0]) == jax.tree.structure(params) and set(out[2]) == {*Terms._fields, "total"}
+def rates(count, *, steps, peak=2e-3, floor=2e-5, warmup=50):
+    """The learning rate of each step, written out."""
+    for step in range(count):
+        done = min((step - warmup) / (max(steps, warmup + 1) - warmup), 1)
+        half = (1 + np.cos(np.pi * done)) / 2
+        yield peak * (step + 1) / warmup if step < warmup else floor + (peak - floor) * half
+
+
+@pytest.mark.parametrize(
+    "count, options",
+    [
+        (14, dict(steps=10, warmup=3, peak=0.3, floor=0.02)), (8, dict(steps=6, warmup=0, peak=0.1)),
+        (120, dict(steps=100)), (55, dict(steps=20)),
+    ],
+    ids=["all told", "no warmup", "as it comes", "shorter than its warmup"],
+)  # fmt: skip
+def test_the_compiled_step_keeps_its_schedule(monkeypatch, count, options):
+    """Adam by hand at rates by hand, of gradients clipped by hand; the batch is the gradient."""
+    gradients = lambda params, batch: ({"w": batch}, Terms(rec=params["w"][0]), jnp.sum(params["w"]))
+    monkeypatch.setattr(learn, "step_gradients", lambda config, **_: gradients)
+    init, step = make_train_step(None, **options)
+    params = {"w": jnp.zeros(2)}
+    state, reached = init(params), []
+    batches = normal(0, count, 2) * np.where(np.arange(count) % 3, 0.3, 5)[:, None].astype(np.float32)
+    for batch in batches:
+        params, state, terms = step(params, state, batch)
+        reached.append(np.asarray(params["w"]))
+    assert set(terms) == {*Terms._fields, "total"}
+    wide = np.asarray(batches, np.float64)
+    clipped = wide / np.maximum(np.linalg.norm(wide, axis=1, keepdims=True), 1)
+    expected = [adam_by_loop(clipped[:, i], 0, rate=list(rates(count, **options)), path=True) for i in range(2)]
+    np.testing.assert_allclose(reached, np.transpose(expected), rtol=1e-4, atol=1e-5 * np.abs(expected).max())
 
 
 # Stages.

@@ -16,9 +16,9 @@ from zestjax.assembly import dequantised
 from zestjax.checks import check_option
 from zestjax.evidence import pooled
 from zestjax.losses.means import mean_over_valid
-from zestjax.losses.objective import Terms, absent, measured, weighted_sum
+from zestjax.losses.objective import Terms, absent, measured, present, weighted_sum
 from zestjax.losses.supervision import depth_cross_entropy_loss
-from zestjax.measures import make_measures
+from zestjax.measures import FRAME_TERMS, RAY_TERMS, SCENE_TERMS, check_weights, make_measures, measurable
 from zestjax.model import Encoding, assemble, reference_frustum, volumes
 from zestjax.precision import geometry_at, network_at
 from zestjax.prediction import render_rays
@@ -28,25 +28,7 @@ from zestjax.solve import Adam
 FRAME_WEIGHTS = Terms(
     rec=20.0, static_rec=8.0, dynamic_rec=4.0, b=1e-3, depth_ce=0.1, mask=0.05, flow3d=0.2, frame_ce=0.1, frame_mask=0.1
 )  # the shipped weights' terms, with the simulator's exact answers
-FRAME_TERMS = ("frame_ce", "frame_mask")
 STAGES = ("all", "frames", "views")
-RAY_TERMS = (
-    "rec",
-    "static_rec",
-    "dynamic_rec",
-    "mask",
-    "b",
-    "flow3d",
-    "pho",
-    "w",
-    "cyc",
-    "min",
-    "sp",
-    "temp",
-    "geo",
-    "depth",
-)
-SCENE_TERMS = ("depth_ce", *FRAME_TERMS)
 MOVER_SHARE = 4  # a cell that moves counts so many times one that does not, in the frames' depths
 
 
@@ -108,7 +90,7 @@ def frames_only(weights):
     return all(absent(w) for name, w in weights._asdict().items() if name not in FRAME_TERMS)
 
 
-def make_train_step(config, *, steps, weights=FRAME_WEIGHTS, peak=2e-3, floor=2e-5, warmup=50):
+def make_train_step(config, *, steps, weights=None, peak=2e-3, floor=2e-5, warmup=50):
     """A run's solver and its compiled step.
 
     Args:
@@ -129,18 +111,22 @@ def make_train_step(config, *, steps, weights=FRAME_WEIGHTS, peak=2e-3, floor=2e
     return solver.init_state, jax.jit(step, donate_argnums=(0, 1))
 
 
-def train_step(config, *, weights=FRAME_WEIGHTS, solver):
+def train_step(config, *, weights=None, solver):
     """One step of training across scenes.
 
     Args:
       config: `presets.Config`.
-      weights: `Terms` of numbers; a term of weight 0 or None is not in the program.
+      weights: `Terms` of numbers; a term of weight 0 or None is not in the program. By default those of `FRAME_WEIGHTS`
+        that the configuration can measure.
       solver: `solve.Adam` (or anything with its `apply`).
 
     Returns:
       `step(params, opt_state, batch) -> (params, opt_state, terms)`, pure; jit it with donated arguments. The objective
       is the mean over the blocks of rays of each block's own. It raises `ValueError` if the rays cannot be shared
       evenly among `config.ray_blocks`. With `frames_only` weights there are no rays and a `FrameBatch` serves.
+
+    Raises:
+      ValueError: a weight whose term cannot be measured here, with what it needs.
     """
     gradients = step_gradients(config, weights=weights)
 
@@ -167,27 +153,30 @@ class Fault(NamedTuple):
         return f"not finite: {lost}{where}; gradient of {some(self.leaves) if self.leaves else 'no parameter'}"
 
 
-def find_fault(params, batch, *, config, weights=FRAME_WEIGHTS):
-    """`Fault` of a step's losses and gradients; compiled when it is asked for, at the cost of one step."""
-
-    @jax.jit
-    def finite(params, batch):
-        grads, terms, _ = step_gradients(config, weights=weights)(params, batch)
-        return jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), (grads, terms._asdict()))
-
-    grads, terms = finite(params, batch)
+def find_fault(params, batch, *, config, weights=None):
+    """`Fault` of a step's losses and gradients; its program is compiled once, at the cost of a step's."""
+    weights = measurable(config, FRAME_WEIGHTS) if weights is None else weights
+    grads, terms = _finite(params, batch, jax.tree.map(jnp.float32, present(weights)), config=config)
     named = jax.tree_util.tree_leaves_with_path(grads)
     leaves = tuple(jax.tree_util.keystr(path) for path, good in named if not good)
     lost = tuple(name for name, good in terms.items() if good is not None and not good)
     return Fault(lost, leaves, int(batch.inputs.time) if hasattr(batch, "inputs") else None)
 
 
-def step_gradients(config, *, weights=FRAME_WEIGHTS):
+@functools.partial(jax.jit, static_argnames="config")
+def _finite(params, batch, weights, *, config):
+    """Which gradients and which terms are finite. The weights are arrays: another value compiles nothing."""
+    grads, terms, _ = step_gradients(config, weights=weights)(params, batch)
+    return jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), (grads, terms._asdict()))
+
+
+def step_gradients(config, *, weights=None):
     """`gradients(params, batch) -> (gradients, `Terms`, their weighted sum)` of `train_step`, see there."""
+    weights = measurable(config, FRAME_WEIGHTS) if weights is None else present(weights)
+    check_weights("train_step", config, weights)
     if frames_only(weights):
         return _frames_gradients(config, weights)
-    of_rays = _only(weights, RAY_TERMS if config.dynamic else ("rec",))
-    rays = functools.partial(_rays, config=config, weights=of_rays)
+    rays = functools.partial(_rays, config=config, weights=_only(weights, RAY_TERMS))
 
     def gradients(params, batch):
         batch = geometry_at(config.precision, batch)
@@ -205,8 +194,7 @@ def step_gradients(config, *, weights=FRAME_WEIGHTS):
         (through,) = pull((towards_encoded, jnp.ones_like(of_scene)))
         grads = jax.tree.map(jnp.add, towards_params, through)
         terms = Terms(*(a if a is not None else b for a, b in zip(terms, found, strict=True)))
-        total = weighted_sum(terms, Terms(*(w if t is not None else None for t, w in zip(terms, weights, strict=True))))
-        return grads, terms, total
+        return grads, terms, weighted_sum(terms, weights)
 
     return gradients
 
@@ -241,10 +229,9 @@ def _scene(params, batch, *, config, weights):
         analysis = jax.lax.stop_gradient(params.analysis) if held else params.analysis
         maps = _analysed(analysis, batch, config)
     encoded = volumes(network_at(config.precision, params), batch.inputs, maps, config=config)
-    guided = all(v is None or v.logits is not None for v in encoded)
-    known = [n for n in SCENE_TERMS if (n == "depth_ce" and guided) or (n != "depth_ce" and maps is not None)]
-    terms = scene_terms(maps, encoded, batch, _only(weights, known))
-    return (encoded, weighted_sum(terms, _only(weights, known))), (maps, terms)
+    weights = _only(weights, SCENE_TERMS)
+    terms = scene_terms(maps, encoded, batch, weights)
+    return (encoded, weighted_sum(terms, weights)), (maps, terms)
 
 
 def _rays(params, encoded, tables, inputs, truth, *, config, weights):

@@ -16,7 +16,7 @@ from zestjax.cameras import project, unproject
 from zestjax.flow import optical_flow, world_flow
 from zestjax.frustum import world_from_frustum
 from zestjax.losses.means import mean_over_valid
-from zestjax.losses.objective import Terms
+from zestjax.losses.objective import Terms, absent
 from zestjax.losses.photometric import photometric_loss, reconstruction_loss
 from zestjax.losses.priors import depth_loss, geometric_loss
 from zestjax.losses.regularisers import blend_entropy_loss, disocclusion_loss
@@ -27,7 +27,66 @@ from zestjax.rendering import composite, confidence_map, weights_from_density
 
 DIRECTIONS = (1, -1)
 NEAR_SURFACE = 0.05  # share of the depth within which a sample counts as on the true surface
+RAY_TERMS = (
+    "rec", "static_rec", "dynamic_rec", "mask", "b", "flow3d", "pho", "w", "cyc", "min", "sp", "temp", "geo", "depth",
+)  # fmt: skip
+FRAME_TERMS = ("frame_ce", "frame_mask")
+SCENE_TERMS = ("depth_ce", *FRAME_TERMS)
+NEIGHBOUR_TERMS = ("pho", "w", "cyc", "min", "sp", "temp", "geo")
 LEAST_WEIGHT = 1e-3  # less is none: a mean by weights that nearly underflow would be all noise
+
+
+def unmeasured(config):
+    """What a training step of a configuration cannot measure.
+
+    Args:
+      config: `presets.Config`.
+
+    Returns:
+      {name of a term: what it needs}.
+    """
+    others = [name for name in Terms._fields if name not in RAY_TERMS + SCENE_TERMS]
+    found = dict.fromkeys(others, "a measure of your own, bound by `losses.objective.make_objective`")
+    volumes = config.geometry or (config.motion and config.dynamic)
+    if not config.dynamic:
+        found |= dict.fromkeys(set(RAY_TERMS) - {"rec", "static_rec"}, "a dynamic field, `dynamic=True`")
+    else:
+        there = [sign for sign in DIRECTIONS if sign in config.slots]
+        if not there:
+            found |= dict.fromkeys(NEIGHBOUR_TERMS, "slots next to the target time, -1 or 1")
+        elif len(there) == 1:
+            found["temp"] = "slots on both sides of the target time, -1 and 1"
+    if not volumes or config.sampling != "guided":
+        found["depth_ce"] = "volumes that guide the sampling: `geometry` or `motion`, with `sampling='guided'`"
+    if not volumes or config.encoder != "frames":
+        found |= dict.fromkeys(FRAME_TERMS, "the frames' own analysis: `encoder='frames'`, with `geometry` or `motion`")
+    return found
+
+
+def check_weights(where, config, weights):
+    """Refuse a weight of what a training step cannot measure: it would train without a word and without the term.
+
+    Args:
+      where: name of the calling function, used in the message.
+      config: `presets.Config`.
+      weights: `Terms`.
+
+    Raises:
+      ValueError: naming the terms, their weights and what they need; or there is no term at all.
+    """
+    if all(absent(weight) for weight in weights):
+        raise ValueError(f"{where}: no term has a weight, so nothing would be learned; give at least one.")
+    needs = unmeasured(config)
+    lost = {name: weight for name, weight in weights._asdict().items() if name in needs and not absent(weight)}
+    if lost:
+        listed = "; ".join(f"`{name}` (weight {weight}) needs {needs[name]}" for name, weight in lost.items())
+        raise ValueError(f"{where}: terms that cannot be measured here: {listed}. Give None or 0, or `measurable`.")
+
+
+def measurable(config, weights):
+    """The `Terms` of those weights whose terms a training step of this configuration can measure; the rest are None."""
+    needs = unmeasured(config)
+    return Terms(**{name: None if name in needs else weight for name, weight in weights._asdict().items()})
 
 
 class Truth(NamedTuple):

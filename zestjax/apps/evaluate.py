@@ -79,7 +79,7 @@ def evaluate_scene(model, options, out):
     opened = open_scene(options.scene, model.config, size=options.size, protocol=options.protocol,
                         targets=options.targets, layout=options.format)  # fmt: skip
     model = standing_still(model) if options.still else model
-    return score_scene(Renderer(model, opened.scene.video), opened, options, out)
+    return score_scene(Renderer(model, opened.scene.video, steady=True), opened, options, out)
 
 
 def score_scene(view_of, opened, options, out):
@@ -103,20 +103,23 @@ def score_scene(view_of, opened, options, out):
 
 
 class Renderer:
-    """Views of one prepared video, timed; the first is rendered twice, so that no compile is counted as rendering.
+    """Views of one prepared video, each with its seconds.
 
-    model: `weights.Model`. video: `Video`. changes: fields of the configuration replaced when rendering.
+    model: `weights.Model`. video: `Video`. steady: what compiles first is run twice, so that seconds are those of
+    compiled programs; for those who report them. changes: fields of the configuration replaced when rendering.
+    prepare_seconds, compile_seconds: None where nothing was run twice to tell them apart.
     """
 
-    def __init__(self, model, video, **changes):
-        self.model, self.compile_seconds = model, None
+    def __init__(self, model, video, *, steady=False, **changes):
+        self.model, self.steady = model, steady
+        self.prepare_seconds = self.compile_seconds = None
         self.config = dataclasses.replace(model.config, **changes)
         self.system = mvsnerf if model.system == PUBLISHED else novel_view
         self.video = jax.tree.map(jnp.asarray, video)
         prepare = lambda: jax.block_until_ready(self.system.prepare(model.params, self.video, config=model.config))
-        self.prepared, first = timed(prepare)
-        self.prepared, self.prepare_seconds = timed(prepare)
-        self.prepare_compile_seconds = max(0.0, first - self.prepare_seconds)
+        self.prepared, self.first_seconds = timed(prepare)
+        if steady:
+            self.prepared, self.prepare_seconds = timed(prepare)
 
     def __call__(self, camera, frame_time, exclude=()):
         """(`View`, seconds)."""
@@ -127,10 +130,10 @@ class Renderer:
             )
         )
         view, seconds = timed(render)
-        if self.compile_seconds is None:
-            first = seconds
+        if self.prepare_seconds is not None and self.compile_seconds is None:
+            first = self.first_seconds + seconds
             view, seconds = timed(render)
-            self.compile_seconds = self.prepare_compile_seconds + max(0.0, first - seconds)
+            self.compile_seconds = max(0.0, first - self.prepare_seconds - seconds)
         return view, seconds
 
 

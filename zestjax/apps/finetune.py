@@ -6,6 +6,7 @@ moves would learn to fade. It is therefore left out, as far as the frames' own a
 
 import dataclasses
 import functools
+import hashlib
 from pathlib import Path
 
 import cv2
@@ -17,10 +18,11 @@ from zestjax import novel_view
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
 from zestjax.apps.scenes import open_scene
-from zestjax.apps.train import summarise
+from zestjax.apps.train import run_name, summarise
 from zestjax.apps.weights import open_weights
 from zestjax.learn import find_fault, make_train_step
 from zestjax.losses.objective import Terms
+from zestjax.measures import measurable
 from zestjax.training import TrainState
 
 RATE = 1e-3
@@ -63,18 +65,28 @@ def finetune(options):
     if len(video.images) - len(set(options.exclude)) < 3:
         raise ValueError(f"finetune: --exclude leaves too few of {len(video.images)} frames; leave at least 3.")
     moving = moving_pixels(model, video, options.exclude)
-    weights = FRAMES_WEIGHTS if moving is None else STILL_WEIGHTS
+    weights = measurable(model.config, FRAMES_WEIGHTS) if moving is None else STILL_WEIGHTS
     init, step_fn = make_train_step(model.config, steps=FOREVER, weights=weights, peak=RATE, floor=RATE, warmup=5)
     explain = functools.partial(find_fault, config=model.config, weights=weights)
     params = jax.tree.map(jnp.array, model.params)  # copies: the step donates
     loop = LoopOptions(options.out, options.steps, options.budget, options.resume, 60.0, quiet=options.quiet)
     metadata = model.metadata | {
-        "seed": options.seed, "start": str(model.path),
-        "data": {"scene": str(options.scene), "exclude": list(options.exclude)},
+        "seed": options.seed, "start": run_name(model.path), "scene": str(options.scene),
+        "data": {"frames": digest(video), "exclude": list(options.exclude)},
     }  # fmt: skip
     batch_at = frame_batches(video, model.config, seed=options.seed, exclude=options.exclude, moving=moving)
     result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "finetune")
+
+
+def digest(video):
+    """What tells one scene's frames, cameras and size from another's, wherever they lie."""
+    found = hashlib.sha256()
+    for leaf in jax.tree.leaves(video):
+        array = np.ascontiguousarray(leaf)
+        found.update(f"{array.shape} {array.dtype}".encode())
+        found.update(array)
+    return found.hexdigest()[:12]
 
 
 def moving_pixels(model, video, exclude):

@@ -105,7 +105,7 @@ def measure(model, scene, setting):
     size = scene.video.images.shape[1:3]
     video = scaled_video(scene.video, setting.scale)
     factors = [new / old for new, old in zip(video.images.shape[1:3], size, strict=True)]
-    view_of = Renderer(model, video, **setting.changes)
+    view_of = Renderer(model, video, steady=True, **setting.changes)
     scores, seconds = [], []
     for target in scene.targets:
         view, spent = view_of(resized(target.camera, factors[1], factors[0]), target.time, target.exclude)

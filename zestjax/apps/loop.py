@@ -21,6 +21,7 @@ from zestjax.io.weights import WeightsError, save_weights
 from zestjax.training import TrainState, training_steps
 
 MOST_FAULTS = 5  # explained in one call: each costs as much as a step
+RECIPE = ("config", "seed", "data", "stage", "peak", "start", "analysis")  # what a run that resumes must share
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,16 +110,24 @@ def _restore(state, out, metadata):
         return state, 0.0
     for warning in found.warnings:
         tqdm.write(f"warning: {warning} Going on from step {found.step}.", file=sys.stderr)
-    differing = [
-        name for name in ("config", "seed", "data", "stage") if found.metadata["run"].get(name) != metadata.get(name)
-    ]
-    if differing:
+    if differing := list(_differing(found.metadata["run"], metadata)):
         raise WeightsError(
             f"{out}: its checkpoints are of a run with another {' and '.join(differing)}; resume it with the same "
             "command, or choose another --out."
         )
     cut_log(out / "log.jsonl", found.step)
     return TrainState(found.tree[0], found.tree[1], found.step), found.metadata["seconds"]
+
+
+def _differing(before, now):
+    """Names of `RECIPE` that two runs do not share; of a dict, also of its entries."""
+    for name in RECIPE:
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            entries = [key for key in old | new if old.get(key) != new.get(key)]
+            yield from [f"{name} ({', '.join(entries)})"] if entries else []
+        elif old != new:
+            yield name
 
 
 def _save(out, state, metadata, seconds):

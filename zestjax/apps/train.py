@@ -3,6 +3,8 @@
 import contextlib
 import dataclasses
 import functools
+import hashlib
+import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +22,8 @@ from zestjax.checks import check_option
 from zestjax.evidence import Evidence
 from zestjax.io.weights import load_weights
 from zestjax.learn import FRAME_WEIGHTS, STAGES, find_fault, make_train_step, stage_weights
+from zestjax.losses.objective import present
+from zestjax.measures import measurable, unmeasured
 from zestjax.model import init_params
 from zestjax.presets import preset as preset_of
 from zestjax.training import TrainState, batch_key, clip_index, clip_window
@@ -93,7 +97,8 @@ def train(options):
     loop = LoopOptions(
         options.out, options.steps, limit, options.resume, 60 * options.checkpoint_minutes, quiet=options.quiet
     )
-    explain = functools.partial(find_fault, config=config, weights=run_weights(options))
+    explain = functools.partial(find_fault, config=config, weights=run_weights(config, options))
+    say_left_out(config, options)
     with batches(config, options) as batch_at:
         result = run_loop(step_fn, state, batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "train")
@@ -109,14 +114,27 @@ def fresh(config, options):
         other: Any = load_weights(options.analysis, like=params)[0]
         params = params._replace(analysis=other.analysis)
     init, step_fn = make_train_step(
-        config, steps=options.steps, weights=run_weights(options), peak=options.peak, floor=options.peak / 100
+        config, steps=options.steps, weights=run_weights(config, options), peak=options.peak, floor=options.peak / 100
     )
     return TrainState(params, init(params), 0), step_fn
 
 
-def run_weights(options):
-    """`Terms` that a run learns from: those of its stage, of what is known of its scenes."""
+def run_weights(config, options):
+    """`Terms` that a run learns from: those of its stage and of its scenes that its system can measure."""
+    return measurable(config, _wanted(options))
+
+
+def _wanted(options):
     return stage_weights(options.stage, weights=FRAMES_WEIGHTS if options.scenes else FRAME_WEIGHTS)
+
+
+def say_left_out(config, options):
+    """Name on standard error the usual terms that this system cannot measure, and why."""
+    needs, wanted = unmeasured(config), present(_wanted(options))
+    lost = {name: needs[name] for name, weight in wanted._asdict().items() if weight is not None and name in needs}
+    if lost and not options.quiet:
+        listed = "; ".join(f"{name} (needs {need})" for name, need in lost.items())
+        print(f"train: this system learns without {listed}", file=sys.stderr)
 
 
 def run_metadata(config, options):
@@ -127,25 +145,26 @@ def run_metadata(config, options):
     return {
         "preset": options.preset, "system": options.system, "config": config, "seed": options.seed,
         "steps": options.steps, "stage": options.stage, "peak": options.peak, "data": data,
-        "start": _run_name(options.weights),
-        "analysis": _run_name(options.analysis), "zestjax": zestjax.__version__,
+        "start": run_name(options.weights),
+        "analysis": run_name(options.analysis), "zestjax": zestjax.__version__,
         "jax": jax.__version__, "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
     }  # fmt: skip
 
 
-def _run_name(weights):
-    """The run that a file of weights comes from, without the machine's folders; None of None."""
+def run_name(weights):
+    """The run that a file of weights comes from, without the machine's folders, and the file's digest; None of None."""
     if weights is None:
         return None
     path = Path(weights)
-    return path.resolve().parent.name if path.stem == "weights" else path.stem
+    name = path.resolve().parent.name if path.stem == "weights" else path.stem
+    return f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()[:12]}"
 
 
 def summarise(result, out, verb):
     """The one line on stdout."""
     state = result.state
     rate = result.report.get("seconds_per_step", float("nan"))
-    ended = "" if result.finished else f" (interrupted; go on with: zestjax {verb} --resume --out {out})"
+    ended = "" if result.finished else " (interrupted; go on with the same command and --resume)"
     loss = result.report.get("total")
     said = "" if loss is None else f", loss {loss:.4f}"
     line = (

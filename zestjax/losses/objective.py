@@ -1,13 +1,16 @@
 """The total loss: the only place in the package where a loss meets its weight.
 
 Terms      one number per loss; used for values, for weights, and (as callables) for how each is measured
-absent     a term whose weight is None or the Python number 0: it is not traced, so the compiled program
+absent     a term whose weight is None or the number 0, Python's or NumPy's: it is not traced, so the compiled program
            does not contain it. A weight that is an array, even one holding 0, is always computed.
 """
 
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
+
+NUMBER = int | float | np.number | np.bool_  # a NumPy scalar is a number; an array of no axes is an array
 
 
 class Terms(NamedTuple):
@@ -51,8 +54,13 @@ STATIC_WEIGHTS = Terms(rec=1.0)
 
 
 def absent(weight):
-    """Whether a weight takes its term out of the program: None, or a Python number equal to 0."""
-    return weight is None or (isinstance(weight, int | float) and weight == 0)
+    """Whether a weight takes its term out of the program: None, or a Python or NumPy number equal to 0."""
+    return weight is None or (isinstance(weight, NUMBER) and weight == 0)
+
+
+def present(weights):
+    """The `Terms` of weights with None for all that are absent."""
+    return Terms(*(None if absent(weight) else weight for weight in weights))
 
 
 def weighted_sum(terms, weights):
@@ -74,7 +82,7 @@ def weighted_sum(terms, weights):
             continue
         if term is None:
             raise ValueError(f"weighted_sum: term `{name}` has weight {weight} but no value; give None or 0 instead.")
-        part = term * (weight if isinstance(weight, int | float) else jnp.asarray(weight).astype(term.dtype))
+        part = term * (float(weight) if isinstance(weight, NUMBER) else jnp.asarray(weight).astype(term.dtype))
         total = part if total is None else total + part
     return jnp.zeros((), jnp.float32) if total is None else total
 
