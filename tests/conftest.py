@@ -1,15 +1,18 @@
-"""The suite runs stricter than users do, and in their precision."""
+"""The suite runs stricter than users do, and in their precision. What is compiled is shared by its workers on disk.
+
+`ZESTJAX_FAST_COMPILING` asks for code that compiles fast instead of running fast, as most of it runs once.
+"""
 
 import importlib.metadata
 import os
+import shutil
+import tempfile
 
 import pytest
 
-# Code that is compiled for a test runs once: unoptimised, by XLA's older emitters, it takes two fifths of the time to
-# compile (20 CPU seconds instead of 51 for a training step).
-if os.environ.get("ZESTJAX_FAST_COMPILING"):
+if os.environ.get("ZESTJAX_FAST_COMPILING"):  # a training step: 20 CPU seconds instead of 51
     flags = [os.environ.get("XLA_FLAGS", ""), "--xla_backend_optimization_level=0"]
-    if importlib.metadata.version("jaxlib").startswith("0.10."):  # later ones lack the older emitters, and the flag
+    if importlib.metadata.version("jaxlib").startswith("0.10."):  # later ones have no older emitters, and no flag
         flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ["XLA_FLAGS"] = " ".join(flags).strip()
 
@@ -21,6 +24,29 @@ assert zestjax.BACKEND.state != "running", "JAX computed before zestjax was impo
 jax.devices()  # from here on no test can change the compiler's flags for the others
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+COMPILED = "ZESTJAX_TEST_COMPILED"  # where the programs of this run lie: workers inherit it
+
+
+def pytest_configure(config):
+    """One folder of compiled programs a run: a step that several modules take is compiled once."""
+    if COMPILED not in os.environ:
+        os.environ[COMPILED] = config.compiled_here = tempfile.mkdtemp(prefix="zestjax-compiled-")
+    jax.config.update("jax_compilation_cache_dir", os.environ[COMPILED])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
+
+
+def pytest_unconfigure(config):
+    if folder := getattr(config, "compiled_here", None):
+        shutil.rmtree(folder, ignore_errors=True)
+        del os.environ[COMPILED]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def nothing_compiled_is_kept():
+    """A worker would hold some GB of programs that no later module runs."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture

@@ -1,5 +1,7 @@
 """The published formulas as slow float64 loops, recorded arrays, and the checks every numerical function gets."""
 
+import importlib
+import sys
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -9,6 +11,15 @@ import pytest
 from zestjax.testing import assert_finite, assert_grads_match, value_and_gradients  # noqa: F401
 
 GOLDEN = Path(__file__).parents[2] / "shared" / "golden"
+
+
+def of_experiments(name):
+    """A script of `experiments/` as a module."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.pop(0)
 
 
 def golden(name, *, batch=False):
@@ -77,10 +88,11 @@ def distortion_by_loop(weights, edges):
     return total
 
 
-def adam_by_loop(gradients, start, *, rate, b1=0.9, b2=0.999, eps=1e-8):
-    """Kingma and Ba, algorithm 1, on one number."""
-    x, mean, square = float(start), 0.0, 0.0
-    for t, g in enumerate(gradients, start=1):
+def adam_by_loop(gradients, start, *, rate, b1=0.9, b2=0.999, eps=1e-8, path=False):
+    """Kingma and Ba, algorithm 1, on one number; `rate` is one, or one for each step. `path`: where each step led."""
+    x, mean, square, led = float(start), 0.0, 0.0, []
+    for t, (g, r) in enumerate(zip(gradients, np.broadcast_to(rate, len(gradients)), strict=True), start=1):
         mean, square = b1 * mean + (1 - b1) * g, b2 * square + (1 - b2) * g * g
-        x -= rate * (mean / (1 - b1**t)) / (np.sqrt(square / (1 - b2**t)) + eps)
-    return x
+        x -= r * (mean / (1 - b1**t)) / (np.sqrt(square / (1 - b2**t)) + eps)
+        led.append(x)
+    return led if path else x

@@ -8,11 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stage
+from oracles import weights_by_loop
 from stage import MINI, PAPER
 
 from zestjax import measures
+from zestjax.fields.conditioning import SourceViews
+from zestjax.fields.dynamic import DynamicSample
 from zestjax.losses.objective import PAPER_WEIGHTS, Terms, measured
 from zestjax.measures import encoding_slots, make_measures, slot_valid, warped
+from zestjax.model import Encoding, reference_frustum
+from zestjax.prediction import Prediction, march
 
 ALL = PAPER_WEIGHTS._replace(static_rec=1.0, mask=1.0, flow3d=1.0)
 
@@ -162,6 +167,116 @@ def test_smooth_terms_match_a_finite_difference_in_the_dynamic_field(x64):
     numeric = (both(jnp.float64(1e-6))[0] - both(jnp.float64(-1e-6))[0]) / 2e-6
     assert numeric != 0
     np.testing.assert_allclose(both(jnp.float64(0))[1], numeric, rtol=1e-4)
+
+
+# Two frames away, in a field that is written down.
+
+
+def drifting(coords, time, xp=np):
+    """`DynamicSample` of (..., 3) points at a time: nothing of it is constant."""
+    x, y, z = (coords[..., i] for i in range(3))
+    wave = lambda a, b, c, d: xp.sin(a * x + b * y + c * z + d * time)
+    forward, backward = (xp.stack([s * wave(i, 2, 3, s) for i in range(3)], -1) for s in (0.04, -0.03))
+    colour = 0.5 + 0.4 * xp.stack([wave(3, 1, -2, i) for i in range(3)], -1)
+    certain = [0.5 + 0.4 * wave(4, -3, 1, s) for s in (1, -1)]
+    return DynamicSample(2 + wave(5, 2, 1, 0.7), colour, 0 * x, forward, backward, *certain)
+
+
+CHAINED = dataclasses.replace(PAPER, slots=(-2, -1, 0, 1, 2))
+
+
+@pytest.fixture
+def followed(monkeypatch):
+    """Compiled: (which slots are valid, chain) -> `Warped`, photometric term; what it started from; where it asked."""
+    asked = []
+
+    def query(params, encoding, coords, directions, time, duration, *, config):
+        assert len(directions) == len(coords) and duration == stage.FRAMES
+        asked.append((int(time), (encoding.slots.times + time).tolist()))
+        return drifting(coords, jnp.float32(time), jnp)
+
+    monkeypatch.setattr(measures, "query_dynamic", query)
+    inputs = stage.inputs_of(CHAINED, time=2)[0]
+    slots = SourceViews(None, None, inputs.slots.valid, encoding_slots(inputs).times)
+    encoding = Encoding(None, None, None, slots, reference_frustum(inputs, CHAINED), None)
+    pixels = np.array([[3, 4], [12, 8], [20, 11]], np.float32)
+    marched = march(encoding, inputs.camera, inputs.near, inputs.far, pixels, config=CHAINED)
+    prediction = Prediction(*[None] * 11, drifting(marched.coords, 2.0, jnp), marched)
+    shown = case()[3]._replace(colour=np.linspace(0, 1, 9, dtype=np.float32).reshape(3, 3))
+
+    @functools.partial(jax.jit, static_argnames="chain")
+    def run(valid, *, chain):
+        asked.clear()
+        given = (None, encoding, inputs._replace(slots=inputs.slots._replace(valid=valid)))
+        terms = make_measures(*given, config=CHAINED, chain=chain)
+        paths = warped(*given, prediction, config=CHAINED, chain=chain)
+        return paths, terms.pho(prediction, shown)
+
+    return run, jax.tree.map(lambda x: np.asarray(x, np.float64), marched), shown.colour, encoding.frustum, asked
+
+
+def in_world(frustum, coords):
+    """Points of a pinhole at x = 0.1 that is not turned, depth linear."""
+    k = np.asarray(frustum.camera.intrinsics, np.float64)
+    depth = stage.NEAR + coords[..., 2] * (stage.FAR - stage.NEAR)
+    u, v = coords[..., 0] * (frustum.width - 1), coords[..., 1] * (frustum.height - 1)
+    place = lambda pixel, i: (pixel - k[i, 2]) / k[i, i] * depth - np.asarray(frustum.camera.camera_from_world)[i, 3]
+    return np.stack([place(u, 0), place(v, 1), depth], -1)
+
+
+def followed_by_loop(marched, frustum):
+    """(colour, confidence) of t + 1, t + 2, t - 1, t - 2; flows there and back of the first and the third."""
+    shown, flows = [], []
+    for sign in (1, -1):
+        coords, certain = marched.coords, 1.0
+        for step in (1, 2):
+            before = drifting(coords, 2 + sign * (step - 1))
+            moved = coords + (before.flow_forward if sign > 0 else before.flow_backward)
+            certain = certain * (before.confidence_forward if sign > 0 else before.confidence_backward)
+            after = drifting(moved, 2 + sign * step)
+            weights = np.stack([weights_by_loop(*ray) for ray in zip(after.density, marched.lengths, strict=True)])
+            shown.append(((weights[..., None] * after.colour).sum(1), (weights * certain).sum(1)))
+            if step == 1:
+                home = moved + (after.flow_backward if sign > 0 else after.flow_forward)
+                here, there, back = (in_world(frustum, x) for x in (coords, moved, home))
+                flows.append((there - here, back - there))
+            coords = moved
+    return shown, flows
+
+
+def test_a_chain_goes_on_from_where_the_step_before_ended(followed):
+    run, marched, target, frustum, asked = followed
+    paths, pho = run(np.ones(5, np.float32), chain=True)
+    assert asked == [(time, [0, 1, 2, 3, 4]) for time in (3, 4, 1, 0)] * 2  # also of the photometric term's own
+    shown, flows = followed_by_loop(marched, frustum)
+    assert paths.colour.shape == (4, 3, 3) and paths.confidence.shape == (4, 3) and paths.valid.tolist() == [1] * 4
+    for i, (colour, confidence) in enumerate(shown):
+        np.testing.assert_allclose(paths.colour[i], colour, atol=2e-6)
+        np.testing.assert_allclose(paths.confidence[i], confidence, atol=2e-6)
+    for i, (there, back) in enumerate(flows):
+        np.testing.assert_allclose(paths.there[i], there, atol=1e-5)
+        np.testing.assert_allclose(paths.back[i], back, atol=1e-5)
+    each = [confidence[:, None] * (colour - target) ** 2 for colour, confidence in shown]
+    np.testing.assert_allclose(pho, np.mean(each), rtol=1e-5)
+    alone, one = run(np.ones(5, np.float32), chain=False)
+    np.testing.assert_allclose(alone.colour, np.stack([shown[i][0] for i in (0, 2)]), atol=2e-6)
+    np.testing.assert_allclose(one, np.mean([each[0], each[2]]), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "missing, valid",
+    [((), (1, 1, 1, 1)), ((-2,), (1, 1, 1, 0)), ((-1,), (1, 1, 0, 0)), ((1,), (0, 0, 1, 1)), ((2, -1), (1, 0, 0, 0)),
+     ((0,), (1, 1, 1, 1))],
+)  # fmt: skip
+def test_a_chain_ends_at_the_first_frame_that_is_missing(followed, missing, valid):
+    """A frame two away does not count where the one between does not exist, and in no mean."""
+    run, marched, target, frustum, _ = followed
+    present = np.array([offset not in missing for offset in CHAINED.slots], np.float32)
+    paths, pho = run(present, chain=True)
+    assert paths.valid.tolist() == list(valid)
+    shown, _ = followed_by_loop(marched, frustum)
+    each = [c[:, None] * (colour - target) ** 2 for (colour, c), v in zip(shown, valid, strict=True) if v]
+    np.testing.assert_allclose(pho, np.mean(each), rtol=1e-5)
 
 
 def test_at_a_neighbour_the_slots_are_named_from_its_own_time():

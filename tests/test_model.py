@@ -240,6 +240,56 @@ def test_half_an_infinite_plane_is_held_at_a_finite_distance():
     assert_all_finite(marched)
 
 
+@pytest.fixture(params=["depth", "inverse"])
+def jittered(request):
+    """Compiled: places in the strata -> `Marched` of five samples a ray; the configuration; the inputs; the pixels."""
+    config = dataclasses.replace(STILL, geometry=False, samples=5, spacing=request.param)
+    inputs = stage.inputs_of(config)[0]
+    encoding, pixels = stage.encoded(None, inputs, None, config), stage.pixels()
+    run = lambda jitter: prediction.march(
+        encoding, inputs.camera, inputs.near, inputs.far, pixels, config=config, jitter=jitter
+    )
+    return jax.jit(run), config, inputs, pixels, encoding
+
+
+def test_jittered_samples_are_each_in_its_stratum(jittered):
+    run, config, _, pixels, _ = jittered
+    draw = lambda key: jax.random.uniform(jax.random.key(key), (len(pixels), 5))
+    found = [jax.tree.map(lambda x: np.asarray(x, np.float64), run(draw(key))) for key in (0, 1, 0)]
+    even = (lambda d: d) if config.spacing == "depth" else (lambda d: 1 / d)
+    near, far = even(stage.NEAR), even(stage.FAR)
+    for marched, key in zip(found, (0, 1, 0), strict=True):
+        fractions = (even(marched.depths) - near) / (far - near)
+        np.testing.assert_allclose(fractions, (np.arange(5) + np.asarray(draw(key))) / 5, atol=1e-5)
+        np.testing.assert_allclose(marched.coords[..., 2], fractions, atol=1e-5)
+        assert (np.diff(marched.depths) > 0).all()
+        # The camera stands at x = 0.1 and looks along z; the intervals tile the ray from near to far.
+        across = (np.asarray(pixels, np.float64) - [11.5, 7.5]) / 24
+        points = np.stack([*np.moveaxis(across[:, None] * marched.depths[..., None], -1, 0), marched.depths], -1)
+        np.testing.assert_allclose(marched.points, points + [0.1, 0, 0], atol=1e-5)
+        whole = (stage.FAR - stage.NEAR) * np.sqrt(1 + (across**2).sum(-1))
+        np.testing.assert_allclose(marched.lengths.sum(-1), whole, rtol=1e-5)
+    jax.tree.map(np.testing.assert_array_equal, found[0], found[2])
+    assert (found[0].depths != found[1].depths).mean() > 0.99
+
+
+def test_jitter_is_about_the_regular_samples(jittered):
+    run, config, inputs, pixels, encoding = jittered
+    same = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5)
+    jax.tree.map(same, run(jnp.full((len(pixels), 5), 0.5)), run(None))
+    even = (lambda d: d) if config.spacing == "depth" else (lambda d: 1 / d)
+    draws = [np.random.default_rng(key).uniform(size=(len(pixels), 5)).astype(np.float32) for key in range(20)]
+    mean = np.mean([even(np.asarray(run(draw).depths, np.float64)) for draw in draws], (0, 1))
+    width = abs(even(stage.FAR) - even(stage.NEAR)) / 5
+    regular = even(np.asarray(run(None).depths, np.float64)[0])
+    assert (abs(mean - regular) < 5 * width / np.sqrt(12 * 20 * len(pixels))).all()
+    params = stage.params_of(config)
+    rendered = jax.jit(
+        lambda jitter: prediction.render_rays(params, encoding, inputs, pixels, config=config, jitter=jitter).marched
+    )
+    np.testing.assert_allclose(rendered(draws[0]).depths, run(draws[0]).depths, rtol=1e-6)
+
+
 # Parts.
 
 

@@ -1,213 +1,127 @@
-"""MVSNeRF from its published weights: every stored stage of the authors' own run is reproduced from its inputs."""
+"""MVSNeRF from its published weights: every stored stage of the authors' own run is reproduced from its inputs.
 
-import jax
+`experiments/check_parity.py` compares them; here it must also fail where something is wrong, and fix no size.
+"""
+
+import subprocess
+import sys
+
 import jax.numpy as jnp
+import mvsnerf_record
 import numpy as np
 import pytest
-from oracles import golden
+from oracles import GOLDEN, golden, of_experiments
 
 from zestjax import mvsnerf
 from zestjax.apps.weights import open_weights
-from zestjax.cameras import Camera, scaled
+from zestjax.cameras import Camera
 from zestjax.cli import main
 from zestjax.io.mvsnerf import mvsnerf_like, mvsnerf_params
 from zestjax.io.weights import WeightsError
-from zestjax.nets.conv3d import conv3d, conv3d_transpose
-from zestjax.nets.feature_pyramid import feature_pyramid, imagenet_normalised
-from zestjax.nets.layers import block2d, norm_act
-from zestjax.nets.positional import positional_encoding
-from zestjax.planesweep import carry, homographies, plane_depths, sweep_grid, warp
-from zestjax.rays import rays_from_pixels
-from zestjax.rendering import alpha_from_density, weights_from_density
 from zestjax.video import Video
 
-# FACTS.md, appendix B: what a float64 run of the authors' code differs by, rounded up.
-TIGHT = dict(rtol=1e-4, atol=1e-4)
-COST = dict(rtol=1e-4, atol=5e-4)  # a difference of squares as large as 81
+check_parity = of_experiments("check_parity")
+
+
+def test_every_array_of_the_authors_run_is_reproduced():
+    record = golden("mvsnerf_golden.npz", batch=True)
+    golden("mvsnerf_v0_weights.npz")
+    rows = check_parity.compare(record, check_parity.read_weights(GOLDEN / "mvsnerf_v0_weights.npz"))
+    assert not [row for row in rows if row.verdict not in ("ok", "input")]
+    assert sorted(row.name for row in rows) == sorted(record)
 
 
 @pytest.fixture(scope="module")
-def record():
-    return golden("mvsnerf_golden.npz")
+def made():
+    """Parameters of the published shapes, made here."""
+    return mvsnerf_record.made_params(mvsnerf_like())
 
 
 @pytest.fixture(scope="module")
-def params():
-    return mvsnerf_params(golden("mvsnerf_v0_weights.npz", batch=True))
+def files(tmp_path_factory, made):
+    """A record of another size, and the weights, as files."""
+    folder, published = tmp_path_factory.mktemp("parity"), published_arrays(made)
+    record = mvsnerf_record.made_record(made, mvsnerf_params(published, statistics="stored"))
+    np.savez(folder / "golden.npz", **record)
+    np.savez(folder / "weights.npz", **published)
+    return folder, record
 
 
-@pytest.fixture(scope="module")
-def stored_params():
-    return mvsnerf_params(golden("mvsnerf_v0_weights.npz", batch=True), statistics="stored")
+def parity(capsys, *paths):
+    """Exit status, {name: the rest of its row}, and the last line."""
+    status = check_parity.main([str(path) for path in paths])
+    lines = capsys.readouterr().out.splitlines()
+    return status, {line.split()[0]: line.split(maxsplit=3)[3] for line in lines[1:-1]}, lines[-1]
 
 
-@pytest.fixture(scope="module")
-def sources(record):
-    near, far = record["near_far"]
-    cameras = Camera(record["intrinsics"][:3], record["w2cs"][:3])
-    images = record["imgs01"][:3].transpose(0, 2, 3, 1)
-    return jax.tree.map(jnp.asarray, mvsnerf.Sources(images, cameras, near, far))
+def test_sizes_are_the_files_own(files, capsys):
+    folder, record = files
+    status, rows, last = parity(capsys, folder / "golden.npz", folder / "weights.npz")
+    said = lambda verdict: {name for name, row in rows.items() if row == verdict}
+    assert status == 0, {name: row for name, row in rows.items() if row.startswith("FAIL")}
+    assert said("missing") == mvsnerf_record.LEFT_OUT and said("input") == set(check_parity.INPUTS)
+    assert said("ok") == set(record) - set(check_parity.INPUTS) and f"{len(said('ok'))} arrays hold" in last
 
 
-def target(record):
-    return Camera(jnp.asarray(record["intrinsics"][3]), jnp.asarray(record["w2cs"][3]))
+def test_an_array_that_differs_in_value_or_shape_is_a_failed_row(files):
+    """Each array in turn: by a thousandth of its greatest value, and without its last entries."""
+    folder, record = files
+    rows, fit = check_parity.prepared(record, check_parity.read_weights(folder / "weights.npz"))
+    assert {row.name for row in rows} == set(check_parity.INPUTS)
+    for name in set(record) - set(check_parity.INPUTS):
+        off = np.float32(1 if name.startswith("inmask") else 1e-3 * max(1, np.abs(record[name]).max()))
+        for changed in (record[name] + off, record[name][..., :-1], record[name] * np.float32(np.nan)):
+            row = check_parity.row_of(name, changed, fit)
+            assert row.name == name and row.verdict == "FAIL", row
+            assert (row.error is None) == (changed.shape != record[name].shape), row
 
 
-def channels_first(x):
-    return np.moveaxis(np.asarray(x), -1, 0)
+def test_what_is_wrong_with_a_file_is_said_in_its_rows(files, capsys):
+    folder, record = files
+    changed = record | {
+        "depth_map": record["depth_map"] + 1, "rays_d": record["rays_d"].T, "alpha": np.array(["no", "numbers"]),
+        "colour_map": np.zeros(3), "u_jitter": record["u_jitter"][:, 1:],
+    }  # fmt: skip
+    del changed["rays_o"]
+    np.savez(folder / "changed.npz", **changed)
+    status, rows, _ = parity(capsys, folder / "changed.npz", folder / "weights.npz")
+    failed = {name for name, row in rows.items() if row.startswith("FAIL")}
+    assert status == 1 and failed == {"depth_map", "rays_d", "alpha", "z_jit"}
+    assert rows["colour_map"] == "unknown: not compared" and rows["rays_o"] == "missing"
+    assert "has shape (3, 5), expected (5, 3)" in rows["rays_d"] and "expected numbers" in rows["alpha"]
 
 
-def feature_warps(sources, planes=16):
-    cameras = scaled(sources.cameras, 0.25, 0.25)
-    first = jax.tree.map(lambda leaf: leaf[0], cameras)
-    return homographies(first, cameras, plane_depths(sources.near, sources.far, planes))
+@pytest.mark.parametrize("change", [lambda x: x[:, 0], lambda x: x[:-1], lambda x: 1 - x])
+def test_images_that_do_not_fit_fail_what_is_computed_from_them(files, capsys, change):
+    folder, record = files
+    np.savez(folder / "images.npz", **record | {"imgs01": change(record["imgs01"])})
+    status, rows, _ = parity(capsys, folder / "images.npz", folder / "weights.npz")
+    assert status == 1 and rows["feats_train"].startswith("FAIL") and rows["rgb_map"].startswith("FAIL")
 
 
-def test_images_are_normalised_alike(record):
-    ours = imagenet_normalised(jnp.asarray(record["imgs01"].transpose(0, 2, 3, 1)))
-    np.testing.assert_allclose(ours.transpose(0, 3, 1, 2), record["imgs_norm"], **TIGHT)
-
-
-def test_first_block_and_features_before_the_head(record, params, sources):
-    x = imagenet_normalised(sources.images)
-    strides = (1, 1, 2, 1, 1, 2, 1, 1)
-    for i, (block, stride) in enumerate(zip(params.features.blocks, strides, strict=True)):
-        x = block2d(block, x, stride=stride, legacy_abs=True)
-        if i == 0:
-            np.testing.assert_allclose(channels_first(x[0]), record["feat_conv0_0_train"], **TIGHT)
-    np.testing.assert_allclose(x.transpose(0, 3, 1, 2), record["feat_conv2_train"], **TIGHT)
-
-
-@pytest.mark.parametrize("mode", ["train", "eval"])
-def test_features_in_both_modes_of_the_norms(record, params, stored_params, sources, mode):
-    used = params if mode == "train" else stored_params
-    ours = feature_pyramid(used.features, sources.images, legacy_abs=True)
-    np.testing.assert_allclose(ours.transpose(0, 3, 1, 2), record[f"feats_{mode}"], **TIGHT)
-
-
-def test_depths_and_homographies(record, sources):
-    depths = plane_depths(sources.near, sources.far, 16)
-    np.testing.assert_allclose(depths, record["depth_values"], rtol=1e-6)
-    warps = feature_warps(sources)
-    theirs = record["proj_mats"][:3]  # A | b: A u + b / d
-    expected = theirs[None, :, :, :3] + 0 * np.asarray(warps)
-    expected[..., 2] += theirs[None, :, :, 3] / np.asarray(depths)[:, None, None]
-    np.testing.assert_allclose(warps, expected, **TIGHT)
-
-
-@pytest.mark.parametrize("padding", [0, 4])
-def test_warp_grids_and_masks(record, sources, padding):
-    warps, grid = feature_warps(sources), sweep_grid(16, 24, padding=padding)
-    for source in (1, 2):
-        u, v, _, front = carry(warps[:, source], grid)
-        ours = np.stack([u / (23 / 2) - 1, v / (15 / 2) - 1], -1)
-        assert np.all(front)
-        np.testing.assert_allclose(ours, record[f"grid{source}_pad{padding}"], **TIGHT)
-        inside = np.all(np.abs(ours) < 1, -1)
-        np.testing.assert_array_equal(inside, record[f"inmask_pad{padding}"][source])
-
-
-def test_warped_features(record, params, sources):
-    """Inside the source their values are ours; over the pixel outside it theirs fade, ours are 0."""
-    features, warps = record["feats_train"][1].transpose(1, 2, 0), feature_warps(sources)
-    for i, plane in enumerate(range(0, 16, 5)):
-        ours = warp(jnp.asarray(features), warps[plane, 1], sweep_grid(16, 24, padding=4)).values
-        inside = record["inmask_pad4"][1, plane].astype(bool)
-        np.testing.assert_allclose(ours[inside], record["warp1_pad4_train"][:, i].transpose(1, 2, 0)[inside], **TIGHT)
-
-
-def test_cost_volume(record, params, sources):
-    ours = jax.jit(lambda: mvsnerf.cost(params, sources, planes=16, padding=4))()
-    np.testing.assert_allclose(channels_first(ours), record["cost_pad4_train"], **COST)
-
-
-def test_stages_of_the_regulariser(record, params):
-    net = params.regulariser
-    act = lambda block, x: norm_act(block.norm, x, legacy_abs=True)
-    x = act(net.stem, conv3d(jnp.asarray(record["cost_pad4_train"].transpose(1, 2, 3, 0)), net.stem.conv.kernel))
-    np.testing.assert_allclose(channels_first(x), record["creg_conv0"], **TIGHT)
-    for (halve, follow), name in zip(net.downs, ("creg_conv2", "creg_conv4", "creg_conv6"), strict=True):
-        x = act(halve, conv3d(x, halve.conv.kernel, stride=2))
-        x = act(follow, conv3d(x, follow.conv.kernel))
-        np.testing.assert_allclose(channels_first(x), record[name], **TIGHT)
-    x = act(net.ups[2], conv3d_transpose(x, net.ups[2].conv.kernel))
-    np.testing.assert_allclose(channels_first(x), record["creg_conv7"], **TIGHT)
-
-
-@pytest.mark.parametrize("padding, mode", [(4, "train"), (4, "eval"), (0, "train")])
-def test_volumes_from_the_images(record, params, stored_params, sources, padding, mode):
-    used = params if mode == "train" else stored_params
-    ours = jax.jit(lambda p: mvsnerf.volume(p, sources, planes=16, padding=padding))(used)
-    np.testing.assert_allclose(channels_first(ours), record[f"vol_pad{padding}_{mode}"], **TIGHT)
-
-
-def test_full_depth_volume(record, params, sources):
-    ours = jax.jit(lambda: mvsnerf.volume(params, sources, planes=128, padding=4))()
-    np.testing.assert_allclose(channels_first(ours)[:, ::8, ::4, ::4], record["vol128_train_strided"], **TIGHT)
-    stats = [float(f(ours)) for f in (jnp.mean, lambda x: jnp.std(x, ddof=1), jnp.min, jnp.max)]
-    np.testing.assert_allclose(stats, record["vol128_stats"], rtol=1e-4)
-
-
-def test_rays_and_points(record):
-    pixels = jnp.stack([jnp.asarray(record["ray_px"], jnp.float32), jnp.asarray(record["ray_py"], jnp.float32)], -1)
-    rays = rays_from_pixels(target(record), pixels)
-    np.testing.assert_allclose(rays.directions, record["rays_d"], **TIGHT)
-    np.testing.assert_allclose(rays.origins[0], record["rays_o"], **TIGHT)
-    near, far = record["near_far"]
-    np.testing.assert_allclose(plane_depths(near, far, 24), record["z_lin"], rtol=1e-6)
-    points = rays.origins[:, None] + record["z_jit"][..., None] * rays.directions[:, None]
-    np.testing.assert_allclose(points, record["rays_pts"], **TIGHT)
-
-
-@pytest.mark.parametrize("padding", [0, 4])
-def test_coords_and_looked_up_features(record, sources, padding):
-    coords = mvsnerf.volume_coords(sources, jnp.asarray(record["rays_pts"]), padding=padding)
-    np.testing.assert_allclose(coords, record[f"rays_ndc_pad{padding}"], **TIGHT)
-    built = jnp.asarray(record[f"vol_pad{padding}_train"].transpose(1, 2, 3, 0))
-    ours = mvsnerf.look_up(built, jnp.asarray(record[f"rays_ndc_pad{padding}"]))
-    np.testing.assert_allclose(ours, record[f"ray_feats_pad{padding}"], **TIGHT)
-
-
-def test_view_colours(record, sources):
-    ours = mvsnerf.view_colours(sources, jnp.asarray(record["rays_pts"].reshape(-1, 3)))
-    np.testing.assert_allclose(ours.reshape(48, 24, 12), record["ray_colors"], **TIGHT)
-
-
-def test_encoding_and_direction(record, sources):
-    ours = positional_encoding(jnp.asarray(record["rays_ndc_pad4"][:2]), levels=10, order="mvsnerf")
-    np.testing.assert_allclose(ours, record["pe_xyz"], **TIGHT)
-
-
-def test_field_output(record, params):
-    coords = jnp.asarray(record["rays_ndc_pad4"].reshape(-1, 3))
-    features = jnp.asarray(np.concatenate([record["ray_feats_pad4"], record["ray_colors"]], -1).reshape(-1, 20))
-    direction = jnp.repeat(jnp.asarray(record["view_dir"]), 24, axis=0)
-    density, colour = mvsnerf.field(params.field, coords, features, direction)
-    ours = jnp.concatenate([colour, density[:, None]], -1).reshape(48, 24, 4)
-    np.testing.assert_allclose(ours, record["raw_rgbsigma"], **TIGHT)
-
-
-def test_opacities_and_weights(record):
-    density = jnp.asarray(record["raw_rgbsigma"][..., 3])
-    ones = jnp.ones(24, jnp.float32)
-    np.testing.assert_allclose(alpha_from_density(density, ones), record["alpha"], **TIGHT)
-    np.testing.assert_allclose(weights_from_density(density, ones), record["weights"], **TIGHT)
-
-
-def test_rendered_colours_and_depths_from_the_images(record, params, sources):
-    pixels = jnp.stack([jnp.asarray(record["ray_px"], jnp.float32), jnp.asarray(record["ray_py"], jnp.float32)], -1)
-    built = jnp.asarray(record["vol_pad4_train"].transpose(1, 2, 3, 0))
-    draw = jax.jit(
-        lambda b: mvsnerf.render(
-            params, b, sources, target(record), pixels, depths=jnp.asarray(record["z_jit"]), padding=4
-        )
+def test_files_of_another_kind_are_refused_in_one_line(files, tmp_path, capsys):
+    folder, record = files
+    (tmp_path / "text.npz").write_text("no arrays")
+    np.save(tmp_path / "one.npy", record["z_lin"])
+    np.savez(tmp_path / "part.npz", imgs01=record["imgs01"])
+    np.savez(tmp_path / "few.npz", **{"fn/nerf.pts_bias.weight": np.zeros((128, 20))})
+    golden, weights = folder / "golden.npz", folder / "weights.npz"
+    for paths, words in {
+        (tmp_path / "text.npz", weights): "text.npz: is no npz", (tmp_path / "one.npy", weights): "one.npy: is no npz",
+        (tmp_path / "part.npz", weights): "part.npz: holds no w2cs, intrinsics, near_far;",
+        (weights, weights): "weights.npz: holds no imgs01", (golden, golden): "golden.npz: lacks or misshapes",
+        (golden, tmp_path / "few.npz"): "few.npz: lacks or misshapes",
+    }.items():  # fmt: skip
+        assert check_parity.main([str(path) for path in paths]) == 2
+        shown = capsys.readouterr()
+        assert not shown.out and shown.err.startswith("error: ") and words in shown.err and shown.err.count("\n") == 1
+    command = [sys.executable, check_parity.__file__, str(tmp_path / "absent.npz"), str(weights)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and not done.stdout
+    assert (
+        done.stderr == f"error: {tmp_path / 'absent.npz'}: could not be read (No such file or directory); "
+        "check the path.\n"
     )
-    ours = draw(built)
-    np.testing.assert_allclose(ours.colour, record["rgb_map"], **TIGHT)
-    np.testing.assert_allclose(ours.depth, record["depth_map"], **TIGHT)
-    whole = draw(mvsnerf.volume(params, sources, planes=16, padding=4))
-    np.testing.assert_allclose(whole.colour, record["rgb_map"], **TIGHT)
-    np.testing.assert_allclose(whole.depth, record["depth_map"], **TIGHT)
 
 
 def published_arrays(params):
@@ -243,14 +157,6 @@ def published_arrays(params):
     }.items():  # fmt: skip
         dense(name, layer)
     return {name: np.asarray(array) for name, array in arrays.items()}
-
-
-@pytest.fixture(scope="module")
-def made():
-    """Parameters of the published shapes, made here."""
-    rng = np.random.default_rng(0)
-    like = mvsnerf_like()
-    return jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape) / 8, x.dtype), like)
 
 
 def test_import_writes_what_evaluate_opens(tmp_path, made):

@@ -77,6 +77,15 @@ def test_mean_far_from_zero_does_not_cost_the_variance():
     np.testing.assert_allclose(norm_act(init_norm(2), x, slope=1.0).std(0), 1, rtol=2e-3)
 
 
+@pytest.mark.parametrize("rows", [1 << 12, 1 << 19])
+def test_statistics_of_many_rows_are_those_of_float64(rows):
+    """A volume's cells; added one to the next in float32 they are 1e-4 off and more."""
+    x = 2 + np.square(sample(rows, 3))
+    wide = np.asarray(x, np.float64)
+    expected = (wide - wide.mean(0)) / np.sqrt(wide.var(0) + 1e-5)
+    np.testing.assert_allclose(norm_act(init_norm(3), x, slope=1.0), expected, rtol=1e-5, atol=1e-5)
+
+
 def test_instance_statistics_are_each_elements_own():
     x, params = sample(3, 4, 5, 2), Norm(jnp.array([1, 2], jnp.float32), jnp.array([0, 1], jnp.float32))
     alone = jnp.concatenate([norm_act(params, x[i : i + 1]) for i in range(3)])

@@ -11,6 +11,7 @@ import stage
 from stage import MINI, PAPER
 
 from zestjax import model, novel_view
+from zestjax.assembly import target_inputs
 from zestjax.novel_view import prepare, render_inputs, render_view
 from zestjax.rays import pixel_grid
 
@@ -90,13 +91,25 @@ def test_excluding_nothing_is_no_exclusion(scene, view):
 def test_a_view_is_a_function_of_its_time(scene, view):
     other = render_view(*scene, CAMERA, 3, config=MINI)
     assert not np.array_equal(other.colour, view.colour)
-    late = render_view(*scene, CAMERA, stage.FRAMES + 3, config=MINI)  # no slot is filled
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(late))
 
 
-def test_a_camera_that_sees_nothing_of_the_video_renders_something_finite(scene):
-    behind = CAMERA._replace(camera_from_world=np.diag([-1.0, 1, -1, 1]).astype(np.float32))
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(render_view(*scene, behind, 2, config=MINI)))
+BEHIND = CAMERA._replace(camera_from_world=np.diag([-1.0, 1, -1, 1]).astype(np.float32))
+
+
+@pytest.mark.parametrize("camera, time", [(CAMERA, stage.FRAMES + 3), (BEHIND, 2)], ids=["no slot", "sees nothing"])
+def test_inputs_that_render_view_would_refuse_render_something_finite(scene, camera, time):
+    params, prepared = scene
+    video = prepared.video
+    inputs, frames = target_inputs(video.images, video.cameras, video.near, video.far, camera, time, config=MINI)
+    view = render_inputs(params, inputs, jax.tree.map(lambda x: x[frames], prepared.maps), config=MINI)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(view))
+
+
+def test_bytes_render_as_the_colours_they_show(scene, view):
+    video = stage.video()
+    quantised = video._replace(images=np.round(video.images * 255).astype(np.uint8))
+    shown = render_view(scene[0], prepare(scene[0], quantised, config=MINI), CAMERA, 2, config=MINI)
+    assert np.abs(shown.colour - view.colour).mean() < 0.01
 
 
 @pytest.mark.parametrize("size", [(13, 18), (9, 5), (1, 1)])

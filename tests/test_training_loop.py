@@ -13,12 +13,18 @@ import numpy as np
 import pytest
 
 from zestjax.apps import clips
+from zestjax.apps.finetune import digest
 from zestjax.apps.log import read_log
 from zestjax.apps.loop import LoopOptions, run_loop
+from zestjax.apps.train import TrainOptions, run_metadata
+from zestjax.apps.weights import SYSTEMS
+from zestjax.cameras import Camera
 from zestjax.io.checkpoints import latest_checkpoint
 from zestjax.io.weights import WeightsError, load_weights
+from zestjax.presets import preset
 from zestjax.solve import Adam
 from zestjax.training import TrainState, batch_key
+from zestjax.video import Video
 
 RUN = {"config": {"width": 3}, "seed": 7, "data": "toy"}
 
@@ -137,6 +143,77 @@ def test_a_folder_of_another_run_is_refused_and_kept(tmp_path, whole):
     with pytest.raises(WeightsError, match="another model or preset"):
         run_loop(toy_step, wide, toy_batch, options(out, 20, resume=True), metadata=RUN)
     assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def recipe(**flags):
+    """What a run of `zestjax train` stores of its flags."""
+    options = TrainOptions(**{"out": "unused", "preset": "tiny"} | flags)
+    return run_metadata(preset(options.preset, precision=options.precision, **SYSTEMS[options.system]), options)
+
+
+def resumed(out, metadata):
+    return run_loop(toy_step, toy_state(), toy_batch, options(out, 4, resume=True), metadata=metadata)
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """A run that began from a file of weights."""
+    folder = tmp_path_factory.mktemp("recipe")
+    for name in ("first", "second"):
+        (folder / name).mkdir()
+        (folder / name / "weights.safetensors").write_text(name)
+    metadata = recipe(weights=folder / "first/weights.safetensors")
+    run_loop(toy_step, toy_state(), toy_batch, options(folder / "run", 2), metadata=metadata)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "said, flags",
+    {
+        "peak": {"peak": 1e-3}, "stage": {"stage": "views"}, "seed": {"seed": 1}, "start": {"weights": None},
+        "analysis": {"analysis": "second/weights.safetensors"}, r"config \(precision\)": {"precision": "bfloat16"},
+        r"config \(.*height.*\)": {"preset": "small"}, r"config \(motion\)": {"system": "zest-geometry"},
+        r"data \(scenes\)": {"scenes": ("a", "b")},
+        r"data \(steps_per_clip, window\)": {"window": 8, "steps_per_clip": 2},
+        r"data \(clip_count\) and stage and peak": {"clip_count": 3, "stage": "views", "peak": 1e-3},
+    }.items(),
+)  # fmt: skip
+def test_a_run_resumes_with_its_own_recipe_alone(begun, said, flags):
+    given = {"weights": "first/weights.safetensors"} | flags
+    paths = {name: begun / given[name] for name in ("weights", "analysis") if given.get(name)}
+    with pytest.raises(WeightsError, match=f"run: its checkpoints are of a run with another {said}; resume it with"):
+        resumed(begun / "run", recipe(**given | paths))
+
+
+def test_weights_are_told_apart_by_what_they_hold(begun):
+    (begun / "moved").mkdir()
+    for name, content in {"same": "first", "other": "second"}.items():
+        (begun / "moved" / f"{name}.safetensors").write_text(content)
+    first, second = (recipe(weights=begun / name / "weights.safetensors")["start"] for name in ("first", "second"))
+    assert first != second and first.split()[1] == recipe(weights=begun / "moved/same.safetensors")["start"].split()[1]
+    (begun / "first/weights.safetensors").write_text("trained on")
+    with pytest.raises(WeightsError, match="another start;"):
+        resumed(begun / "run", recipe(weights=begun / "first/weights.safetensors"))
+    (begun / "first/weights.safetensors").write_text("first")
+
+
+def test_what_does_not_change_the_numbers_may_change(begun):
+    free = {"steps": 9, "minutes": 3.0, "checkpoint_minutes": 1.0, "quiet": True, "clips": "there", "out": "elsewhere"}
+    ended = resumed(begun / "run", recipe(weights=begun / "first/weights.safetensors", **free))
+    assert ended.finished and ended.state.step == 4
+
+
+def test_a_scene_is_known_by_its_frames_cameras_and_size():
+    rng = np.random.default_rng(0)
+    camera = Camera(np.ones((2, 3, 3), np.float32), np.ones((2, 4, 4), np.float32))
+    video = Video(rng.uniform(size=(2, 4, 6, 3)).astype(np.float32), camera, np.float32(1), np.float32(9))
+    moved = camera._replace(camera_from_world=2 * camera.camera_from_world)
+    others = [
+        video._replace(images=video.images.reshape(2, 6, 4, 3)), video._replace(images=video.images[::-1]),
+        video._replace(cameras=moved), video._replace(far=np.float32(8)),
+    ]  # fmt: skip
+    assert digest(video) == digest(jax.tree.map(np.copy, video))
+    assert len({digest(v) for v in (video, *others)}) == 5
 
 
 def test_a_full_disk_costs_no_earlier_checkpoint(tmp_path, monkeypatch, whole):

@@ -45,8 +45,12 @@ def footage(images):
 
 @jax.jit
 def _halved(images):
-    images = images.astype(jnp.float32) / 255 if images.dtype == jnp.uint8 else images
-    return half_images(images)
+    return half_images(colours_of(images))
+
+
+def colours_of(images):
+    """Images as they are, or of uint8 their float32 in [0, 1]."""
+    return images.astype(jnp.float32) / 255 if images.dtype == jnp.uint8 else images
 
 
 @functools.partial(jax.jit, static_argnames=("planes",))
@@ -123,9 +127,9 @@ def target_inputs(images, cameras, near, far, camera, time, *, config, exclude=(
     around = slots(count, time, offsets=config.slots, exclude=exclude)
 
     def pack(c):
-        shown = jnp.asarray(images[c.frames])
-        shown = shown.astype(jnp.float32) / 255 if shown.dtype == jnp.uint8 else shown
-        return Frames(shown, taken(cameras, c.frames), c.valid, c.frames.astype(np.float32))
+        return Frames(
+            colours_of(jnp.asarray(images[c.frames])), taken(cameras, c.frames), c.valid, c.frames.astype(np.float32)
+        )
 
     inputs = Inputs(
         pack(chosen), pack(around)._replace(times=np.float32(time) + np.asarray(config.slots, np.float32)),

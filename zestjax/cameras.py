@@ -215,8 +215,8 @@ def check_camera(where, camera):
       camera: `Camera`, any leading axes.
 
     Raises:
-      ValueError: if a shape is wrong, an entry is not finite, intrinsics are singular, not upper triangular or do not
-        end in (0, 0, 1), or a pose is not rigid (rotation of determinant 1, last row (0, 0, 0, 1)).
+      ValueError: if a shape is wrong, an entry is not finite, a focal length is not above 0, intrinsics are not upper
+        triangular or do not end in (0, 0, 1), or a pose is not rigid (determinant 1, last row (0, 0, 0, 1)).
     """
     check_shapes(
         where, intrinsics=(camera.intrinsics, "... 3 3"), camera_from_world=(camera.camera_from_world, "... 4 4")
@@ -229,6 +229,7 @@ def check_camera(where, camera):
         "`intrinsics` has an entry that is not finite": ~np.isfinite(k).all((-2, -1)),
         "`camera_from_world` has an entry that is not finite": ~np.isfinite(pose).all((-2, -1)),
         "`intrinsics` is singular: a focal length is 0": (k[..., 0, 0] == 0) | (k[..., 1, 1] == 0),
+        "`intrinsics` has a focal length below 0, which mirrors the image": (k[..., 0, 0] < 0) | (k[..., 1, 1] < 0),
         "`intrinsics` is not upper triangular with (0, 0, 1) in its last row": (np.abs(lower) > 1e-6).any(-1),
         "`camera_from_world` is not rigid: its rotation is not orthonormal": (np.abs(gram - np.eye(3)) > 1e-3).any(
             (-2, -1)

@@ -1,5 +1,7 @@
-"""Shape checks that run while JAX traces, and cost nothing once compiled."""
+"""Checks of arguments: of shapes, types and options. They run while JAX traces, and cost nothing once compiled."""
 
+import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -58,3 +60,28 @@ def check_option(where, /, **options):
         if value not in valid:
             listed = ", ".join(repr(v) for v in valid)
             raise ValueError(f"{where}: `{name}` is {value!r}, expected one of {listed}.")
+
+
+def check_types(where, /, **values):
+    """Refuse a value that is not of its type: `check_types("f", video=(video, Video))`.
+
+    Raises:
+      ValueError: naming the function, the argument and both types.
+    """
+    for name, (value, wanted) in values.items():
+        if not isinstance(value, wanted):
+            raise ValueError(f"{where}: `{name}` should be a `{wanted.__name__}`, got `{type(value).__name__}`.")
+
+
+def check_known(where, /, **trees):
+    """Refuse what has no values yet because it is being traced, where a choice depends on the values.
+
+    Raises:
+      ValueError: naming the function and the argument.
+    """
+    for name, tree in trees.items():
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
+            raise ValueError(
+                f"{where}: `{name}` is traced, expected an array with values, by which frames are chosen on the host; "
+                "call it outside `jit`, `grad` and `vmap`."
+            )

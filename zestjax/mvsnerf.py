@@ -15,13 +15,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.assembly import positions, taken
+from zestjax.assembly import colours_of, positions, taken
 from zestjax.cameras import Camera, project, scaled
 from zestjax.checks import check_shapes
 from zestjax.cost_volume import mvsnerf_cost_volume, quarter_colours
 from zestjax.depth import expected_depth
 from zestjax.fields.trunk import ColourHead, Trunk, direct_colour, init_colour_head, init_trunk, trunk
 from zestjax.frustum import Frustum, cells_from_frustum, frustum_from_world
+from zestjax.inputs import check_exclude, check_inputs, check_view
 from zestjax.nets.cost_regulariser import CostRegulariser, cost_regulariser, init_cost_regulariser
 from zestjax.nets.feature_pyramid import FeaturePyramid, feature_pyramid, imagenet_normalised, init_feature_pyramid
 from zestjax.nets.layers import Dense, dense, init_dense
@@ -223,8 +224,14 @@ def render(params, built, sources, camera, pixels, *, depths=None, padding, samp
 
 
 def prepare(params, video, *, config, exclude=()):
-    """Nothing is known of a scene before a view is asked for; see `novel_view.prepare`."""
-    del params, config, exclude
+    """The `Video` on the host: nothing is known of a scene before a view is asked for; see `novel_view.prepare`.
+
+    Raises:
+      ValueError: if no view can be predicted from the video, or it has no such frame to exclude; see `zestjax.inputs`.
+    """
+    del params, config
+    video = check_inputs("mvsnerf.prepare", video, quantised=True)
+    check_exclude("mvsnerf.prepare", len(video.images), exclude)
     return video
 
 
@@ -245,13 +252,17 @@ def render_view(params, video, camera, time, *, config, exclude=()):
       `View`, without what moves.
 
     Raises:
-      ValueError: fewer sources than the weights were made for, or an image size that is not a multiple of 4.
+      ValueError: before anything is compiled, if the video cannot give the view (see `zestjax.inputs`); fewer sources
+        than the weights were made for, or an image size that is not a multiple of 4.
     """
-    if (left := len(video.images) - len(set(exclude))) < config.views:
+    where = "mvsnerf.render_view"
+    video = check_inputs(where, video, quantised=True)
+    time, exclude = check_view(where, video, camera, time, exclude=exclude)
+    if (left := len(video.images) - len(exclude)) < config.views:
         raise ValueError(f"mvsnerf: a view needs {config.views} source frames, {left} are left; give more frames.")
     centre = positions(jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], camera))[0]
-    found = key_frames(positions(video.cameras), config.views, target=centre, time=int(time), exclude=exclude)
-    images = jnp.asarray(video.images)[found.frames]
+    found = key_frames(positions(video.cameras), config.views, target=centre, time=time, exclude=exclude)
+    images = colours_of(jnp.asarray(video.images[found.frames]))
     return _render_image(
         params, Sources(images, taken(video.cameras, found.frames), video.near, video.far), camera, config
     )

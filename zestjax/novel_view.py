@@ -15,7 +15,9 @@ import numpy as np
 from zestjax.analysis import FrameMaps, frame_maps
 from zestjax.assembly import Footage, dequantised, footage, target_inputs, video_evidence
 from zestjax.cameras import project
+from zestjax.checks import check_types
 from zestjax.frustum import world_from_frustum
+from zestjax.inputs import check_exclude, check_inputs, check_view
 from zestjax.model import encode
 from zestjax.precision import geometry_at, network_at
 from zestjax.prediction import render_rays
@@ -69,18 +71,35 @@ def prepare(params, video, *, config, exclude=()):
 
     Args:
       params: `model.ZestParams`.
-      video: `Video`.
+      video: `Video`, whose images may be uint8.
       config: `presets.Config`.
       exclude: see the header.
 
     Returns:
       `Prepared`.
+
+    Raises:
+      ValueError: before anything is compiled, if no view can be predicted from the video (see `inputs.check_inputs`), a
+        frame to exclude is not in it, or `params` lack what `config` computes.
     """
-    video = video._replace(images=np.asarray(video.images), cameras=jax.tree.map(np.asarray, video.cameras))
+    video = check_inputs("novel_view.prepare", video, quantised=True)
+    exclude = check_exclude("novel_view.prepare", len(video.images), exclude)
+    _check_params("novel_view.prepare", params, config)
     if params.analysis is None:
         return Prepared(video, None, None)
     seen = footage(video.images)
     return Prepared(video, seen, _frame_maps(params, seen, video, config, exclude=exclude))
+
+
+def _check_params(where, params, config):
+    """Refuse parameters without a part that the configuration computes."""
+    motion = config.motion and config.dynamic
+    analysed = config.encoder == "frames" and (config.geometry or motion)
+    parts = dict(analysis=analysed, geometry=config.geometry, motion=motion, dynamic=config.dynamic)
+    if lacking := [name for name, needed in parts.items() if needed and getattr(params, name) is None]:
+        raise ValueError(
+            f"{where}: `params` have no `{lacking[0]}`, which `config` asks for; give the configuration of the weights."
+        )
 
 
 def render_view(params, prepared, camera, time, *, config, exclude=()):
@@ -96,13 +115,22 @@ def render_view(params, prepared, camera, time, *, config, exclude=()):
 
     Returns:
       `View`.
+
+    Raises:
+      ValueError: before anything is compiled, if the video cannot give the view (see `inputs.check_view`), or `params`
+        lack what `config` computes or `prepared` what they need.
     """
-    video = prepared.video
+    where = "novel_view.render_view"
+    check_types(where, prepared=(prepared, Prepared))
+    _check_params(where, params, config)
+    video, maps = prepared.video, prepared.maps
+    if maps is None and params.analysis is not None:
+        raise ValueError(f"{where}: `prepared` has no maps of its frames; prepare the video with the same `params`.")
+    time, exclude = check_view(where, video, camera, time, exclude=exclude)
     inputs, frames = target_inputs(
-        video.images, video.cameras, video.near, video.far, camera, int(time), config=config, exclude=exclude
+        video.images, video.cameras, video.near, video.far, camera, time, config=config, exclude=exclude
     )
-    maps = prepared.maps
-    if maps is not None and len(exclude):
+    if maps is not None and exclude:
         maps = _frame_maps(params, prepared.footage, video, config, frames=frames, exclude=exclude)
     elif maps is not None:
         maps = jax.tree.map(lambda x: x[frames], maps)

@@ -10,7 +10,9 @@ import jax
 import numpy as np
 
 from zestjax.cameras import Camera, check_bounds, check_camera
-from zestjax.checks import check_shapes
+from zestjax.checks import check_known, check_shapes, check_types
+
+ROUNDING = 1e-4  # by which a colour may leave [0, 1]: a resize exceeds it by its sums' rounding, and no eye sees it
 
 
 class Video(NamedTuple):
@@ -23,30 +25,47 @@ class Video(NamedTuple):
     far: jax.Array
 
 
-def check_video(where, video):
+def check_video(where, video, *, quantised=False):
     """Refuse a video that no later stage could use. For arrays with values: call it before `jax.jit`, not inside.
 
     Args:
       where: name of the calling function, used in the message.
       video: `Video`.
+      quantised: uint8 images will do as well, 255 being 1.
+
+    Returns:
+      `Video` with images and cameras on the host.
 
     Raises:
-      ValueError: if shapes disagree, a colour is outside [0, 1] or not finite (bytes must be divided by 255), a camera
-        is degenerate, or the depth bounds are not 0 < near < far.
+      ValueError: if it is no `Video` of a `Camera`, is traced, shapes disagree, a colour is outside [0, 1] or not
+        finite (bytes must be divided by 255), a camera is degenerate, or the depth bounds are not 0 < near < far.
     """
+    check_types(where, video=(video, Video))
+    check_types(where, cameras=(video.cameras, Camera))
+    check_known(where, video=video)
+    video = video._replace(images=np.asarray(video.images), cameras=jax.tree.map(np.asarray, video.cameras))
     check_shapes(
         where,
         images=(video.images, "N H W 3"),
         intrinsics=(video.cameras.intrinsics, "N 3 3"),
         camera_from_world=(video.cameras.camera_from_world, "N 4 4"),
+        near=(video.near, ""),
+        far=(video.far, ""),
     )
-    images = np.asarray(video.images)
-    if images.size == 0 or images.dtype.kind != "f" or not (images.min() >= 0 and images.max() <= 1):
-        raise ValueError(f"{where}: `images` should be floats in [0, 1], got {_described(images)}.")
+    _check_colours(where, video.images, quantised)
     check_camera(where, video.cameras)
     check_bounds(where, video.near, video.far)
+    return video
 
 
-def _described(images):
-    values = f" from {images.min()} to {images.max()}" if images.size else ""
-    return f"{images.dtype} of shape {images.shape}{values}"
+def _check_colours(where, images, quantised):
+    if quantised and images.dtype == np.uint8 and images.size:
+        return
+    low, high = (images.min(), images.max()) if images.size else (1, 0)
+    if images.dtype.kind != "f" or not -ROUNDING <= low <= high <= 1 + ROUNDING:
+        values = f" from {low:.6g} to {high:.6g}" if images.size else ""
+        bytes_ = images.size and (images.dtype.kind in "iu" or high > 1)
+        raise ValueError(
+            f"{where}: `images` should be floats in [0, 1], got {images.dtype} of shape {images.shape}{values}"
+            f"{'; divide bytes by 255' if bytes_ else ''}."
+        )

@@ -58,7 +58,7 @@ def matmul_peak():
     return 2 * n**3 / min(times[1:])
 
 
-def timed(run, compiled, repeats):
+def timed(run, repeats):
     """Best and median seconds of a call, after two that do not count."""
     times = []
     for _ in range(repeats + 2):
@@ -66,8 +66,12 @@ def timed(run, compiled, repeats):
         jax.block_until_ready(run())
         times.append(time.perf_counter() - start)
     counted = sorted(times[2:] or times[-1:])
-    cost = compiled.cost_analysis() or {}
-    return {"best": counted[0], "median": counted[len(counted) // 2], "flops": cost.get("flops")}
+    return {"best": counted[0], "median": counted[len(counted) // 2]}
+
+
+def flops(compiled):
+    """Operations that the compiled program states, or None."""
+    return (compiled.cost_analysis() or {}).get("flops")
 
 
 def measure_step(config, clip, repeats):
@@ -86,7 +90,7 @@ def measure_step(config, clip, repeats):
         *state[:], info = compiled(*state, batch)
         return info
 
-    return {"compile": seconds, **timed(run, compiled, repeats), "temp_mb": temporary(compiled)}
+    return {"compile": seconds, **timed(run, repeats), "flops": flops(compiled), "temp_mb": temporary(compiled)}
 
 
 def measure_view(config, clip, repeats, rows):
@@ -103,7 +107,7 @@ def measure_view(config, clip, repeats, rows):
     compiled = novel_view.render_inputs.lower(params, inputs, maps, config=config, rows=rows or None).compile()
     seconds = time.perf_counter() - start
     run = lambda: compiled(params, inputs, maps)
-    return {"compile": seconds, **timed(run, compiled, repeats), "temp_mb": temporary(compiled)}
+    return {"compile": seconds, **timed(run, repeats), "flops": flops(compiled), "temp_mb": temporary(compiled)}
 
 
 def temporary(compiled):

@@ -19,8 +19,8 @@ from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
 from zestjax.apps.tables import headline, write_table
 from zestjax.apps.weights import PUBLISHED, at_precision, open_weights, standing_still
+from zestjax.inputs import check_target
 from zestjax.io.files import write_bytes
-from zestjax.io.inputs import check_target
 from zestjax.io.lpips import load_lpips
 from zestjax.io.pictures import depth_picture, error_picture, share_picture, side_by_side, write_image
 

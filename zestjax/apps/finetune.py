@@ -85,7 +85,7 @@ def digest(video):
     for leaf in jax.tree.leaves(video):
         array = np.ascontiguousarray(leaf)
         found.update(f"{array.shape} {array.dtype}".encode())
-        found.update(array)
+        found.update(array.tobytes())
     return found.hexdigest()[:12]
 
 

@@ -14,8 +14,8 @@ from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import number
 from zestjax.apps.weights import at_precision, open_weights, standing_still
 from zestjax.cameras import resized
+from zestjax.inputs import check_target
 from zestjax.io.files import write_bytes
-from zestjax.io.inputs import check_target
 from zestjax.io.pictures import resize_area, write_image
 from zestjax.io.video import write_video
 

@@ -23,9 +23,9 @@ import numpy as np
 
 from zestjax.cameras import Camera, resized
 from zestjax.checks import check_option
+from zestjax.inputs import check_inputs
 from zestjax.io.flow_files import read_flo
 from zestjax.io.idr import is_idr, read_idr
-from zestjax.io.inputs import check_inputs
 from zestjax.io.layouts import select
 from zestjax.io.llff import is_llff, read_llff
 from zestjax.io.nrnerf import is_nrnerf, read_nrnerf

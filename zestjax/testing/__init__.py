@@ -9,8 +9,9 @@ They take any function over pytrees:
 """
 
 from zestjax.testing.backend import Check, backend_checks, check_backend
-from zestjax.testing.explain import Explanation, Origin, explain_gradient
+from zestjax.testing.explain import Explanation, explain_gradient
 from zestjax.testing.gradients import assert_finite, assert_grads_match, held, value_and_gradients
+from zestjax.testing.origin import Origin
 
 __all__ = [
     "Check",

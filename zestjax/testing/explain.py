@@ -7,26 +7,16 @@ group  parameters that share the first steps of their path in the tree
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from zestjax.testing.walk import place_of, program, run
+from zestjax.testing.origin import Origin, find_origin
 
-
-class Origin(NamedTuple):
-    """The first operation whose result is not finite though what it was given is. term: str. operation: str.
-    where: file and line of the code that asked for it. shape: of the result. stage: `value` or `gradient`."""
-
-    term: str
-    operation: str
-    where: str
-    shape: tuple
-    stage: str
+NOT_FOUND = "not finite, yet nothing is found where it begins: run one at a time, all operations are finite"
 
 
 class Explanation(NamedTuple):
     """terms, groups: names. values: (T,) of the losses. norms: (T, G) Euclidean norms of their gradients.
-    origin: `Origin`, or None when everything is finite."""
+    origin: `Origin`, or None when everything is finite or nothing is found."""
 
     terms: tuple[str, ...]
     groups: tuple[str, ...]
@@ -41,10 +31,10 @@ class Explanation(NamedTuple):
             f"{term:{wide}}  {value:10.4g}  " + "  ".join(f"{norm:12.4g}" for norm in norms)
             for term, value, norms in zip(self.terms, self.values, self.norms, strict=True)
         ]
-        found = "everything is finite"
+        finite = np.isfinite(self.values).all() and np.isfinite(self.norms).all()
+        found = "everything is finite" if finite else NOT_FOUND
         if self.origin is not None:
-            o = self.origin
-            found = f"not finite first in the {o.stage} of `{o.term}`: {o.operation} {o.shape} at {o.where}"
+            found = str(self.origin)
         return "\n".join([head, *rows, found])
 
 
@@ -77,33 +67,10 @@ def explain_gradient(losses, params, *, depth=1):
         values.append(float(value))
         norms.append([squares[group] ** 0.5 for group in groups])
         if origin is None and not np.isfinite([values[-1], *norms[-1]]).all():
-            origin = _origin(lambda p, term=term: named(p)[term], params, term)
+            origin = find_origin(lambda p, term=term: named(p)[term], params, term)
     return Explanation(tuple(shapes), groups, np.array(values), np.array(norms), origin)
 
 
 def _named(losses):
     named = losses if isinstance(losses, dict) else losses._asdict()
     return {str(name): value for name, value in named.items() if value is not None}
-
-
-def _origin(loss, params, term):
-    for stage, fn in (("value", loss), ("gradient", jax.grad(loss))):
-        closed, leaves, _ = program(fn, params)
-        found = []
-
-        def visit(equation, inputs, outputs, found=found):
-            if not found and _finite(inputs) and not _finite(outputs):
-                found.append((equation, outputs))
-            return outputs
-
-        run(closed, leaves, visit)
-        if found:
-            equation, outputs = found[0]
-            where = place_of(equation)
-            return Origin(term, equation.primitive.name, where, tuple(outputs[0].shape), stage)
-    return None
-
-
-def _finite(arrays):
-    floats = [x for x in arrays if hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.inexact)]
-    return all(bool(jnp.all(jnp.isfinite(x))) for x in floats)

@@ -22,9 +22,20 @@ def program(fn, *args):
     return jaxpr, leaves, jax.tree.structure(shape)
 
 
-def run(closed, leaves, visit):
-    """Outputs of a program; what is compiled, rematerialised or scanned inside is walked through too."""
-    return _run(closed.jaxpr, closed.consts, leaves, visit)
+def run(closed, leaves, visit, *, taken=False):
+    """Outputs of a program; what is compiled, rematerialised or scanned inside is walked through too.
+
+    Args:
+      closed: `ClosedJaxpr`.
+      leaves: its arguments.
+      visit: sees every primitive and may change what it gives. A `scan` is also visited where it takes a row apart and
+        where it stacks its turns, so that no array appears that was not visited.
+      taken: walk into the branch that a `cond` takes and the turns that a `while` makes. It needs values, not tracers.
+
+    Returns:
+      List of arrays.
+    """
+    return _run(closed, leaves, visit, taken)
 
 
 def contains(closed, name):
@@ -43,26 +54,35 @@ def _inner(equation):
     ]  # fmt: skip
 
 
-def _run(jaxpr, consts, leaves, visit):
+def _run(program, leaves, visit, taken):
+    jaxpr, consts = _jaxpr(program), program.consts if isinstance(program, ClosedJaxpr) else ()
     known = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(zip(jaxpr.invars, leaves, strict=True))
     read = lambda variable: variable.val if isinstance(variable, Literal) else known[variable]
     for equation in jaxpr.eqns:
         inputs = [read(variable) for variable in equation.invars]
-        known.update(zip(equation.outvars, _outputs(equation, inputs, visit), strict=True))
+        known.update(zip(equation.outvars, _outputs(equation, inputs, visit, taken), strict=True))
     return [read(variable) for variable in jaxpr.outvars]
 
 
-def _outputs(equation, inputs, visit):
-    name, inner = equation.primitive.name, _inner(equation)
-    if name in INLINED and inner:
-        consts = inner[0].consts if isinstance(inner[0], ClosedJaxpr) else ()
-        within = lambda inside, inputs, outputs: visit(_placed(inside, equation), inputs, outputs)
-        return _run(_jaxpr(inner[0]), consts, inputs, within)
+def _outputs(equation, inputs, visit, taken):
+    name, params = equation.primitive.name, equation.params
+    within = lambda inside, inputs, outputs: visit(_placed(inside, equation), inputs, outputs)
+    if name in INLINED and (inner := _inner(equation)):
+        return _run(inner[0], inputs, within, taken)
     if name == "scan":
-        return _scan(equation.params, inputs, visit)
+        return _scan(equation, inputs, within, taken)
+    if name == "cond" and taken:
+        branch = min(max(int(inputs[0]), 0), len(params["branches"]) - 1)
+        return _run(params["branches"][branch], inputs[1:], within, taken)
+    if name == "while" and taken:
+        return _while(equation, inputs, within)
+    return visit(equation, inputs, bind(equation, inputs))
+
+
+def bind(equation, inputs):
+    """Outputs of one operation, a list."""
     outputs = equation.primitive.bind(*inputs, **equation.params)
-    outputs = list(outputs) if equation.primitive.multiple_results else [outputs]
-    return visit(equation, inputs, outputs)
+    return list(outputs) if equation.primitive.multiple_results else [outputs]
 
 
 def place_of(equation):
@@ -75,18 +95,38 @@ def _placed(equation, caller):
     return equation if place_of(equation) else equation.replace(source_info=caller.source_info)
 
 
-def _scan(params, inputs, visit):
+def _scan(equation, inputs, visit, taken):
     """One turn after the other; the outputs of the turns are stacked again."""
+    params = equation.params
     consts, carry = params["num_consts"], params["num_carry"]
     fixed, state, rows = inputs[:consts], inputs[consts : consts + carry], inputs[consts + carry :]
     turns = range(params["length"])
     found = []
     for i in reversed(turns) if params["reverse"] else turns:
-        out = run(params["jaxpr"], [*fixed, *state, *(row[i] for row in rows)], visit)
+        now = [visit(equation, [row], [row[i]])[0] for row in rows]
+        out = _run(params["jaxpr"], [*fixed, *state, *now], visit, taken)
         state = out[:carry]
         found.append(out[carry:])
     found = found[::-1] if params["reverse"] else found
     if not found:
         shapes = [variable.aval for variable in params["jaxpr"].jaxpr.outvars[carry:]]
         return [*state, *(jnp.zeros((0, *s.shape), s.dtype) for s in shapes)]
-    return [*state, *(jnp.stack(column) for column in zip(*found, strict=True))]
+    return [*state, *(visit(equation, list(turns), [jnp.stack(turns)])[0] for turns in zip(*found, strict=True))]
+
+
+def _while(equation, inputs, visit):
+    """Turn by turn while the condition holds; of a mapped loop, those rows move on for which it does."""
+    params = equation.params
+    asked, made = params["cond_nconsts"], params["body_nconsts"]
+    of_condition, of_body, state = inputs[:asked], inputs[asked : asked + made], inputs[asked + made :]
+
+    def moved(goes, new, old):
+        goes = jnp.reshape(goes, goes.shape + (1,) * (jnp.ndim(new) - goes.ndim))
+        return visit(equation, [new, old], [jnp.where(goes, new, old)])[0]
+
+    while True:
+        (goes,) = _run(params["cond_jaxpr"], [*of_condition, *state], visit, True)
+        if not jnp.any(goes):
+            return state
+        new = _run(params["body_jaxpr"], [*of_body, *state], visit, True)
+        state = [moved(goes, *pair) for pair in zip(new, state, strict=True)] if goes.shape else new
