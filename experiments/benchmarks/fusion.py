@@ -101,7 +101,7 @@ def main():
         for side in SIDES:
             found = turn(options, side)
             print(json.dumps({"side": side, "load": os.getloadavg()[0], **found}), file=sys.stderr, flush=True)
-            rows[side] = {what: min(value, rows.get(side, found)[what]) for what, value in found.items()}
+            rows[side] = {what: min(value, rows.setdefault(side, found)[what]) for what, value in found.items()}
     off, on = rows.values()
     print(f"| what | {' | '.join(rows)} | off / on |\n|---|---|---|---|")
     for what in off:
