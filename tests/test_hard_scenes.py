@@ -74,6 +74,25 @@ def test_half_precision_networks_are_finite_there(scene, system):
     assert np.isfinite(flat(compiled(system, "bfloat16")(*hard(system, scene)))).all()
 
 
+def same_direction(whole, half):
+    assert {g.dtype for g in jax.tree.leaves((whole, half))} == {jnp.dtype("float32")}
+    whole, half = flat(whole), flat(half)
+    return whole @ half / np.linalg.norm(whole) / np.linalg.norm(half) > 0.9
+
+
+def test_a_half_precision_step_learns_in_the_same_direction_with_whole_gradients():
+    args = hard("mini", SCENES[0])
+    assert same_direction(compiled("mini")(*args)[0], compiled("mini", "bfloat16")(*args)[0])
+
+
+@pytest.mark.slow
+def test_a_half_precision_step_of_the_papers_system_does_too():
+    # At random weights points come next to the camera's plane, where the geometric loss tells any two roundings apart.
+    weights, args = PAPER_WEIGHTS._replace(geo=None), hard("paper", SCENES[0])
+    step = lambda precision: step_gradients(dataclasses.replace(PAPER, precision=precision), weights=weights)
+    assert same_direction(*(jax.jit(step(precision))(*args)[0] for precision in ("float32", "bfloat16")))
+
+
 @pytest.mark.slow
 @BY_SYSTEM
 def test_run_eagerly_it_is_the_same(system):
