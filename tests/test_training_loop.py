@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zestjax.apps import clips
+from zestjax.apps import clips, run_folder
 from zestjax.apps.finetune import digest
 from zestjax.apps.log import read_log
 from zestjax.apps.loop import LoopOptions, run_loop
-from zestjax.apps.train import TrainOptions, run_metadata
+from zestjax.apps.train import TrainOptions, run_metadata, summarise
 from zestjax.apps.weights import SYSTEMS
 from zestjax.cameras import Camera
 from zestjax.io.checkpoints import latest_checkpoint
-from zestjax.io.weights import WeightsError, load_weights
+from zestjax.io.weights import WeightsError, load_weights, save_weights
 from zestjax.presets import preset
 from zestjax.solve import Adam
 from zestjax.training import TrainState, batch_key
@@ -60,7 +60,7 @@ def test_a_run_leaves_weights_log_curve_and_checkpoints(tmp_path, whole):
     weights, metadata = load_weights(out / "weights.safetensors", like=toy_state().params)
     np.testing.assert_array_equal(weights["w"], whole.state.params["w"])
     assert metadata["seed"] == 7 and metadata["step"] == 10
-    assert [line["step"] for line in read_log(out / "log.jsonl")] == list(range(1, 11))
+    assert [line["step"] for line in read_log(out / "log.jsonl")[0]] == list(range(1, 11))
     assert len(list((out / "checkpoints").iterdir())) == 2
 
 
@@ -76,7 +76,7 @@ def test_a_run_broken_off_by_an_error_resumes_to_the_same_bits(tmp_path, whole):
     resumed = run_loop(toy_step, toy_state(), toy_batch, options(out, 10, resume=True), metadata=RUN)
     for name in ("params", "opt_state"):
         np.testing.assert_array_equal(getattr(resumed.state, name)["w"], getattr(whole.state, name)["w"])
-    assert [line["step"] for line in read_log(out / "log.jsonl")] == list(range(1, 11))
+    assert [line["step"] for line in read_log(out / "log.jsonl")[0]] == list(range(1, 11))
 
 
 SCRIPT = """
@@ -143,6 +143,101 @@ def test_a_folder_of_another_run_is_refused_and_kept(tmp_path, whole):
     with pytest.raises(WeightsError, match="another model or preset"):
         run_loop(toy_step, wide, toy_batch, options(out, 20, resume=True), metadata=RUN)
     assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("lost", ["missing", "damaged", "of an earlier step", "of another run"])
+def test_a_run_that_ended_before_its_weights_were_written_writes_them_when_resumed(tmp_path, lost, whole):
+    out = tmp_path / "whole"
+    weights, expected = out / "weights.safetensors", whole.state.params
+    if lost == "missing":
+        weights.unlink()
+    elif lost == "damaged":
+        weights.write_bytes(weights.read_bytes()[:-7])
+    else:
+        step = 9 if lost == "of an earlier step" else 10
+        save_weights(weights, {"w": jnp.ones(3)}, metadata=RUN | {"step": step})
+    (out / "curve.png").unlink()
+    result = run_loop(toy_step, toy_state(), toy_batch, options(out, 10, resume=True), metadata=RUN)
+    written, metadata = load_weights(weights, like=toy_state().params)
+    np.testing.assert_array_equal(written["w"], expected["w"])
+    assert metadata["step"] == 10 and (out / "curve.png").is_file()
+    line = summarise(result, out, "train").line
+    assert "nothing was left to do" in line and "nan" not in line and "loss" in line
+
+
+def test_a_run_whose_seconds_are_used_up_takes_no_further_step(tmp_path, whole):
+    given = options(tmp_path / "whole", 99, resume=True, seconds=whole.seconds)
+    assert run_loop(toy_step, toy_state(), toy_batch, given, metadata=RUN).state.step == 10
+
+
+def test_the_log_of_a_run_killed_before_its_first_checkpoint_begins_again(tmp_path):
+    (tmp_path / "log.jsonl").write_text('{"step": 2, "total": 9}\n{"step": 4, "tot')
+    (tmp_path / "faults.jsonl").write_text('{"step": 2, "fault": "x"}\n')
+    run_loop(toy_step, toy_state(), toy_batch, options(tmp_path, 3, resume=True), metadata=RUN)
+    lines, dropped = read_log(tmp_path / "log.jsonl")
+    assert [line["step"] for line in lines] == [1, 2, 3] and not dropped and lines[1]["total"] != 9
+    assert (tmp_path / "faults.jsonl").read_text() == ""
+
+
+def test_lines_of_a_log_that_are_no_records_are_left_out_and_counted(tmp_path, capsys, whole):
+    log = tmp_path / "whole" / "log.jsonl"
+    odd = [b"5", b"[]", b'{"seconds": 1}', b'{"step": "3"}', b"\xff\xfe", b'{"st', b"[" * 100_000, b'{"step": true}']
+    log.write_bytes(b"\n".join(odd) + b"\n" + log.read_bytes() + b'{"step": 11, "to')
+    resumed = run_loop(toy_step, toy_state(), toy_batch, options(log.parent, 12, resume=True), metadata=RUN)
+    assert [line["step"] for line in read_log(log)[0]] == list(range(1, 13)) and resumed.finished
+    assert "log.jsonl: 8 lines are no record of a step and left out." in capsys.readouterr().err
+
+
+def test_what_a_killed_write_left_is_removed(tmp_path, whole):
+    out = tmp_path / "whole"
+    left = [out / ".weights.safetensors.ab12.part", out / "checkpoints/.step_000000011.safetensors.cd34.part"]
+    for path in left:
+        path.write_text("half")
+    run_loop(toy_step, toy_state(), toy_batch, options(out, 12, resume=True), metadata=RUN)
+    assert not any(path.exists() for path in left)
+
+
+def test_a_folder_serves_one_run_at_a_time(tmp_path):
+    with run_folder.held(tmp_path):
+        for resume in (False, True):
+            with pytest.raises(ValueError, match=f"process {os.getpid()} on .* is training into it; wait"):
+                run_loop(toy_step, toy_state(), toy_batch, options(tmp_path, 3, resume=resume), metadata=RUN)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / run_folder.LOCK).write_text("process 1 on a machine that lost its power\n")
+    assert run_loop(toy_step, toy_state(), toy_batch, options(tmp_path, 3), metadata=RUN).finished
+
+
+def test_another_number_of_threads_is_told(tmp_path, monkeypatch, capsys, whole):
+    run_loop(toy_step, toy_state(), toy_batch, options(tmp_path / "whole", 11, resume=True), metadata=RUN)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setenv("PJRT_NPROC", "77")
+    run_loop(toy_step, toy_state(), toy_batch, options(tmp_path / "whole", 12, resume=True), metadata=RUN)
+    assert "now on 77: the last bits" in capsys.readouterr().err
+
+
+def test_a_newest_checkpoint_that_cannot_be_read_falls_back_to_the_one_before(tmp_path, capsys, whole):
+    newest = sorted((tmp_path / "whole" / "checkpoints").iterdir())[-1]
+    newest.unlink()
+    (newest / "kept").mkdir(parents=True)
+    resumed = run_loop(toy_step, toy_state(), toy_batch, options(tmp_path / "whole", 10, resume=True), metadata=RUN)
+    np.testing.assert_array_equal(resumed.state.params["w"], whole.state.params["w"])
+    assert "Going on from step 9" in capsys.readouterr().err and newest.is_file()
+    assert len(list(newest.parent.glob("not_*/*/kept"))) == 1
+
+
+def test_an_error_saves_the_state_that_it_met(tmp_path):
+    def breaking(step):
+        if step == 6:
+            raise RuntimeError("the producer ended")
+        return toy_batch(step)
+
+    rare = LoopOptions(tmp_path, 10, quiet=True, log_steps=4)
+    donating = jax.jit(toy_step, donate_argnums=(0, 1))
+    with pytest.raises(RuntimeError, match="the producer ended"):
+        run_loop(donating, toy_state(), breaking, rare, metadata=RUN)
+    assert [line["step"] for line in read_log(tmp_path / "log.jsonl")[0]] == [4, 6]
+    found = latest_checkpoint(tmp_path / "checkpoints", (toy_state().params, toy_state().opt_state))
+    assert found is not None and found.step == 6
 
 
 def recipe(**flags):
@@ -253,7 +348,7 @@ PRODUCER = """
 import sys
 from typing import NamedTuple
 import numpy as np
-from zestjax.apps import clips
+from zestjax.apps import clips, run_folder
 
 class Toy(NamedTuple):
     images: np.ndarray

@@ -162,16 +162,15 @@ def run_name(weights):
 
 def summarise(result, out, verb):
     """The one line on stdout."""
-    state = result.state
-    rate = result.report.get("seconds_per_step", float("nan"))
-    ended = "" if result.finished else " (interrupted; go on with the same command and --resume)"
+    state, weights = result.state, Path(out) / "weights.safetensors"
     loss = result.report.get("total")
     said = "" if loss is None else f", loss {loss:.4f}"
-    line = (
-        f"{verb}: {state.step} steps in {result.seconds:.0f} s ({rate:.2f} s a step, "
-        f"compile {result.compile_seconds:.0f} s){said}: {Path(out) / 'weights.safetensors'}{ended}"
+    rate = result.report.get("seconds_per_step", float("nan"))
+    spent = f"{rate:.2f} s a step, compile {result.compile_seconds:.0f} s" if result.steps else "nothing was left to do"
+    ended = "" if result.finished else " (interrupted)"
+    return Summary(
+        f"{verb}: {state.step} steps in {result.seconds:.0f} s ({spent}){said}: {weights}{ended}", weights, result
     )
-    return Summary(line, Path(out) / "weights.safetensors", result)
 
 
 def batches(config, options):

@@ -39,6 +39,13 @@ def _write(path, content):
         raise
 
 
+def remove_parts(folder):
+    """Remove what `write_bytes` left in a folder when its process was killed; nobody else may write there meanwhile."""
+    for part in Path(folder).glob(".*.part"):
+        if part.is_file():
+            part.unlink(missing_ok=True)
+
+
 @contextlib.contextmanager
 def replaced_folder(path, *, marker):
     """Context: yields an empty folder to fill, which takes the place of `path` once the block succeeds.
