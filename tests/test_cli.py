@@ -205,7 +205,7 @@ def test_a_full_disk_is_one_line(places, grey, capsys, monkeypatch):
     def full(path, content):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr("zestjax.apps.evaluate.write_bytes", full)
+    monkeypatch.setattr("zestjax.apps.results.write_bytes", full)
     refused(capsys, run(places, "evaluate", "--no-pictures", "--quiet"), "No space left", "free some space")
 
 

@@ -22,7 +22,7 @@ def network_at(precision, params):
     Raises:
       ValueError: float64 where JAX has it switched off.
     """
-    if precision == "float64" and not jax.config.read("jax_enable_x64"):
+    if precision == "float64" and not jax.config.jax_enable_x64:
         raise ValueError(
             "network_at: precision `float64` needs 64-bit JAX: call jax.config.update('jax_enable_x64', True) first."
         )

@@ -19,7 +19,7 @@ from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.train import run_name, summarise
-from zestjax.apps.weights import open_weights
+from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.learn import find_fault, make_train_step
 from zestjax.losses.objective import Terms
 from zestjax.measures import measurable
@@ -48,6 +48,7 @@ class FinetuneOptions:
     quiet: bool = False
 
 
+@arithmetic()
 def finetune(options):
     """Run `zestjax finetune`.
 

@@ -16,7 +16,7 @@ from zestjax.apps.clips import EVIDENCE, ClipSource, ClipSpec, clip_folder, hole
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
 from zestjax.apps.scenes import open_scene
-from zestjax.apps.weights import SYSTEMS
+from zestjax.apps.weights import SYSTEMS, arithmetic
 from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
 from zestjax.checks import check_option
 from zestjax.evidence import Evidence
@@ -75,6 +75,7 @@ class Summary(NamedTuple):
     result: LoopResult
 
 
+@arithmetic()
 def train(options):
     """Run `zestjax train`.
 
