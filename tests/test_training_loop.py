@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zestjax.apps import clips, run_folder
+from zestjax.apps import clips, producer, run_folder
 from zestjax.apps.finetune import digest
 from zestjax.apps.log import read_log
 from zestjax.apps.loop import LoopOptions, run_loop
@@ -346,9 +346,10 @@ def test_the_log_holds_means_and_skips_non_finite_steps(tmp_path):
 
 PRODUCER = """
 import sys
+import time
 from typing import NamedTuple
 import numpy as np
-from zestjax.apps import clips, run_folder
+from zestjax.apps import clips, producer, run_folder
 
 class Toy(NamedTuple):
     images: np.ndarray
@@ -357,6 +358,7 @@ class Toy(NamedTuple):
 def render(spec, index):
     if index == 13:
         raise ValueError("clip 13 is unlucky")
+    time.sleep(0.3 if index == 40 else 0)
     return Toy(np.full((2, spec.height, spec.width, 3), index, np.uint8))
 
 clips.render_clip = render
@@ -365,12 +367,17 @@ sys.exit(clips.main(sys.argv[1:]))
 
 
 @pytest.fixture
-def source(tmp_path, monkeypatch):
+def toy_producer(tmp_path, monkeypatch):
     """Clips from a real producer process whose renderer is a toy."""
     popen = subprocess.Popen
     run = lambda command, **kw: popen([sys.executable, "-c", PRODUCER, *command[3:]], **kw)
-    monkeypatch.setattr(clips.subprocess, "Popen", run)
-    with clips.ClipSource(clips.ClipSpec(0, 4, 6), tmp_path, alive=3, evict=True) as source:
+    monkeypatch.setattr(producer.subprocess, "Popen", run)
+    return lambda: producer.ClipSource(clips.ClipSpec(0, 4, 6), tmp_path, alive=3, evict=True)
+
+
+@pytest.fixture
+def source(toy_producer):
+    with toy_producer() as source:
         yield source
 
 
@@ -388,9 +395,57 @@ def test_a_damaged_clip_is_rendered_again(source, tmp_path):
     assert (source.clip(5, [5])["images"] == 5).all()
 
 
-def test_a_producer_that_fails_says_why(source):
-    with pytest.raises(RuntimeError, match="clip 13 is unlucky"):
+@pytest.mark.parametrize("change", [{"index": 4}, {"seed": 1}, {"frames": 3}, {"code": "of an upgrade"}])
+def test_a_clip_of_another_origin_is_rendered_again(source, tmp_path, capfd, change, monkeypatch):
+    spec = clips.ClipSpec(0, 4, 6)._replace(**{k: v for k, v in change.items() if k in ("seed", "frames")})
+    with monkeypatch.context() as patch:
+        if "code" in change:
+            patch.setattr(clips, "_code", lambda *_: change["code"])
+        origin = clips.origin_of(spec, change.get("index", 5))
+    clips.write_clip(clips.clip_path(tmp_path, 5), {"images": np.zeros(3)}, origin)
+    assert (source.clip(5, [5])["images"] == 5).all()
+    said = capfd.readouterr().err
+    assert "clip-000005.npz: holds clip" in said and "expected clip 5 of seed 0, 4x6, 16+8 frames" in said
+
+
+def test_a_missing_module_is_not_taken_for_an_empty_one():
+    with pytest.raises(ValueError, match="has no moved.py"):
+        clips._code("simulate/*.py", "moved.py")
+
+
+def test_a_producer_that_fails_says_why(source, capfd):
+    with pytest.raises(producer.ProducerError, match="ended with exit code 1: ValueError: clip 13 is unlucky"):
         source.clip(13, [13])
+    assert capfd.readouterr().err.count("it is started once more") == 1
+
+
+def test_a_producer_that_is_killed_is_started_again(source, tmp_path, capfd):
+    for index in (40, 41):
+        source.producer.ask([index, index + 100])
+        os.kill(source.producer.process.pid, signal.SIGKILL)
+        source.producer.process.wait()
+        assert (source.clip(index, [index])["images"] == index).all()
+    assert capfd.readouterr().err.count("was ended by SIGKILL") == 2
+
+
+def test_two_trainers_may_share_a_folder_of_clips(toy_producer, tmp_path):
+    with toy_producer() as first, toy_producer() as second:
+        second.clip(0, range(0, 3))
+        for index in range(0, 9, 2):
+            assert (first.clip(index, range(index, index + 3))["images"] == index).all()
+        for index in range(1, 5):
+            assert (second.clip(index, range(index, index + 3))["images"] == index).all()
+    assert clips.clip_path(tmp_path, 9).exists() and not clips.clip_path(tmp_path, 0).exists()
+
+
+def test_clips_that_vanish_are_asked_for_again(source, tmp_path):
+    source.clip(0, range(0, 3))
+    while source.producer.pending:
+        source.producer._listen()
+    for path in tmp_path.iterdir():
+        path.unlink()
+    tmp_path.rmdir()
+    assert (source.clip(2, range(0, 3))["images"] == 2).all()
 
 
 def test_the_producer_ends_with_its_trainer(source):

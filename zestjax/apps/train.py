@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import jax
 
 import zestjax
-from zestjax.apps.clips import EVIDENCE, ClipSource, ClipSpec, clip_folder, hole_key
+from zestjax.apps.clips import EVIDENCE, ClipSpec, clip_folder, hole_key
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
+from zestjax.apps.producer import ClipSource
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.weights import SYSTEMS, arithmetic
 from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
