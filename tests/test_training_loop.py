@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from zestjax.apps import clips, producer, run_folder
-from zestjax.apps.finetune import digest
 from zestjax.apps.log import read_log
 from zestjax.apps.loop import LoopOptions, run_loop
+from zestjax.apps.scenes import digest
 from zestjax.apps.train import TrainOptions, run_metadata, summarise
 from zestjax.apps.weights import SYSTEMS
 from zestjax.cameras import Camera
@@ -242,8 +242,10 @@ def test_an_error_saves_the_state_that_it_met(tmp_path):
 
 def recipe(**flags):
     """What a run of `zestjax train` stores of its flags."""
+    videos = flags.pop("videos", ())
     options = TrainOptions(**{"out": "unused", "preset": "tiny"} | flags)
-    return run_metadata(preset(options.preset, precision=options.precision, **SYSTEMS[options.system]), options)
+    config = preset(options.preset, precision=options.precision, **SYSTEMS[options.system])
+    return run_metadata(config, options, videos)
 
 
 def resumed(out, metadata):
@@ -268,7 +270,7 @@ def begun(tmp_path_factory):
         "peak": {"peak": 1e-3}, "stage": {"stage": "views"}, "seed": {"seed": 1}, "start": {"weights": None},
         "analysis": {"analysis": "second/weights.safetensors"}, r"config \(precision\)": {"precision": "bfloat16"},
         r"config \(.*height.*\)": {"preset": "small"}, r"config \(motion\)": {"system": "zest-geometry"},
-        r"data \(scenes\)": {"scenes": ("a", "b")},
+        r"data \(scenes\)": {"videos": (np.ones(3), np.ones(3))},
         r"data \(steps_per_clip, window\)": {"window": 8, "steps_per_clip": 2},
         r"data \(clip_count\) and stage and peak": {"clip_count": 3, "stage": "views", "peak": 1e-3},
     }.items(),

@@ -104,7 +104,8 @@ def write_clip(path, arrays, origin):
     """Write arrays by name, atomically; those that are None are left out."""
     buffer = io.BytesIO()
     known: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
-    np.savez(buffer, **known, **{ORIGIN: np.array(origin)})
+    known[ORIGIN] = np.array(origin)
+    np.savez(buffer, **known)
     write_bytes(path, buffer.getvalue())
 
 

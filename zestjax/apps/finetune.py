@@ -6,7 +6,6 @@ moves would learn to fade. It is therefore left out, as far as the frames' own a
 
 import dataclasses
 import functools
-import hashlib
 from pathlib import Path
 
 import cv2
@@ -17,7 +16,7 @@ import numpy as np
 from zestjax import novel_view
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
-from zestjax.apps.scenes import open_scene
+from zestjax.apps.scenes import digest, open_scene, place_of
 from zestjax.apps.train import run_name, summarise
 from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.learn import find_fault, make_train_step
@@ -72,22 +71,12 @@ def finetune(options):
     params = jax.tree.map(jnp.array, model.params)  # copies: the step donates
     loop = LoopOptions(options.out, options.steps, options.budget, options.resume, 60.0, quiet=options.quiet)
     metadata = model.metadata | {
-        "seed": options.seed, "start": run_name(model.path), "scene": str(options.scene),
+        "seed": options.seed, "start": run_name(model.path), "scene": place_of(options.scene),
         "data": {"frames": digest(video), "exclude": list(options.exclude)},
     }  # fmt: skip
     batch_at = frame_batches(video, model.config, seed=options.seed, exclude=options.exclude, moving=moving)
     result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "finetune")
-
-
-def digest(video):
-    """What tells one scene's frames, cameras and size from another's, wherever they lie."""
-    found = hashlib.sha256()
-    for leaf in jax.tree.leaves(video):
-        array = np.ascontiguousarray(leaf)
-        found.update(f"{array.shape} {array.dtype}".encode())
-        found.update(array.tobytes())
-    return found.hexdigest()[:12]
 
 
 def moving_pixels(model, video, exclude):
