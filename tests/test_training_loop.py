@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -349,6 +350,7 @@ def test_the_log_holds_means_and_skips_non_finite_steps(tmp_path):
 PRODUCER = """
 import sys
 import time
+from pathlib import Path
 from typing import NamedTuple
 import numpy as np
 from zestjax.apps import clips, producer, run_folder
@@ -470,3 +472,22 @@ def test_a_step_that_is_skipped_is_explained_and_the_run_goes_on(tmp_path, capsy
     assert int(ended.state.opt_state.skipped) == 1 and np.isfinite(ended.state.params["w"]).all()
     assert json.loads((tmp_path / "faults.jsonl").read_text()) == {"step": 3, "fault": "not finite: batch nan"}
     assert "warning: step 3 was skipped; not finite: batch nan" in capsys.readouterr().err
+
+
+def test_a_full_disk_names_the_log_and_saves_the_state(tmp_path, monkeypatch):
+    opened = Path.open
+
+    def full(path, mode="r", *arguments):
+        if mode == "ab":
+            raise OSError(28, "No space left on device")
+        return opened(path, mode, *arguments)
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(OSError, match="No space left on device; free some space") as caught:
+        run_loop(toy_step, toy_state(), toy_batch, options(tmp_path, 9), metadata=RUN)
+    assert caught.value.filename == str(tmp_path / "log.jsonl")
+    monkeypatch.undo()
+    resumed = run_loop(toy_step, toy_state(), toy_batch, options(tmp_path, 9, resume=True), metadata=RUN)
+    plain = run_loop(toy_step, toy_state(), toy_batch, options(tmp_path / "plain", 9), metadata=RUN)
+    np.testing.assert_array_equal(resumed.state.params["w"], plain.state.params["w"])
+    assert len(list((tmp_path / "checkpoints").glob("step_*"))) == 2

@@ -4,7 +4,8 @@
     clip     one rendered scene: frames to read and targets to predict
 
 A step's batch is a function of (seed, n) alone, so a run that is killed and resumed computes what an uninterrupted
-one does, bit for bit on one machine. Nothing here reads a clock, prints or writes: `zestjax.apps.train` does.
+one does, bit for bit on one machine with one number of threads. Nothing here reads a clock, prints or writes:
+`zestjax.apps.train` does.
 """
 
 from typing import Any, NamedTuple

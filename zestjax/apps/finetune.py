@@ -28,6 +28,7 @@ RATE = 1e-3
 STILL_WEIGHTS = Terms(static_rec=20.0)
 MOVING = 0.3  # probability of moving from which a pixel is left out, and its surroundings with it
 FOREVER = 1_000_000
+CHECKPOINT_SECONDS = 60.0  # the default budget: a run that asks for more loses at most this much to a kill
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +70,9 @@ def finetune(options):
     init, step_fn = make_train_step(model.config, steps=FOREVER, weights=weights, peak=RATE, floor=RATE, warmup=5)
     explain = functools.partial(find_fault, config=model.config, weights=weights)
     params = jax.tree.map(jnp.array, model.params)  # copies: the step donates
-    loop = LoopOptions(options.out, options.steps, options.budget, options.resume, 60.0, quiet=options.quiet)
+    loop = LoopOptions(
+        options.out, options.steps, options.budget, options.resume, CHECKPOINT_SECONDS, quiet=options.quiet
+    )
     metadata = model.metadata | {
         "seed": options.seed, "start": run_name(model.path), "scene": place_of(options.scene),
         "data": {"frames": digest(video), "exclude": list(options.exclude)},

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from zestjax.io.files import write_bytes
+from zestjax.io.files import append_bytes, write_bytes
 
 PATIENCE = 50  # steps in a row whose loss may be non-finite before the run gives up
 CLOCK = ("step", "seconds", "seconds_per_step")
@@ -48,8 +48,7 @@ class Recorder:
             "seconds": round(seconds, 2),
             "seconds_per_step": round(spent / len(self.kept), 4),
         } | means
-        with self.path.open("a") as file:
-            file.write(json.dumps(self.last) + "\n")
+        append_bytes(self.path, (json.dumps(self.last) + "\n").encode())
         self.mark, self.kept = seconds, []
 
     def draw(self, path, *, least_seconds=60.0):

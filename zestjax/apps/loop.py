@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from zestjax.apps import run_folder
 from zestjax.apps.log import Recorder, draw_curve, read_log
+from zestjax.io.files import append_bytes
 from zestjax.training import TrainState, training_steps
 
 MOST_FAULTS = 5  # explained in one call: each costs as much as a step
@@ -144,8 +145,7 @@ class _Faults:
         self.left -= 1
         said = str(self.explain(state.params, batch_at(state.step - 1)))
         tqdm.write(f"warning: step {state.step} was skipped; {said}", file=sys.stderr)
-        with self.path.open("a") as file:
-            file.write(json.dumps({"step": state.step, "fault": said}) + "\n")
+        append_bytes(self.path, (json.dumps({"step": state.step, "fault": said}) + "\n").encode())
 
 
 class _Clock:

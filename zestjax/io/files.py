@@ -86,6 +86,16 @@ def _write(path, content):
         raise
 
 
+def append_bytes(path, content):
+    """Add to the end of a file, which is made when missing.
+
+    Raises:
+      OSError: the disk is full or the place not writable; a part may have been added.
+    """
+    with _explained(path, "its last line may be cut short"), Path(path).open("ab") as file:
+        file.write(content)
+
+
 def remove_parts(folder):
     """Remove what `write_bytes` left in a folder when its process was killed; nobody else may write there meanwhile."""
     for part in Path(folder).glob(".*.part"):
