@@ -12,7 +12,7 @@ FAST = ZESTJAX_FAST_COMPILING=1
 TEST_ENV = PJRT_NPROC=1 OMP_NUM_THREADS=1 MPLBACKEND=Agg
 PYTEST = $(TEST_ENV) $(RUN) -m pytest -q -n $(WORKERS) --dist loadfile
 
-.PHONY: test lint demo bench mutations stability precision notebooks test-slow test-lowest test-newest clean
+.PHONY: test lint demo bench mutations stability precision kills notebooks test-slow test-lowest test-newest clean
 
 $(VENV)/installed: pyproject.toml
 	@test -n "$(PYTHON)" || { echo "error: no Python 3.11-3.13 with venv found; pass PYTHON=/path/to/python" >&2; exit 2; }
@@ -49,6 +49,10 @@ stability: $(VENV)/installed
 # What float32, bfloat16 networks and float64 cost and give up, on the same weights.
 precision: $(VENV)/installed
 	$(RUN) experiments/precision.py --out runs/precision
+
+# Kill trainings 100 times, inside their writes and at random, and compare what they resume to with an unbroken run.
+kills: $(VENV)/installed
+	$(RUN) experiments/kills.py --out runs/kills
 
 # Run the notebooks and write experiments/notebooks/rendered/.
 notebooks: $(VENV)/installed

@@ -19,7 +19,7 @@ from zestjax import batches, learn
 from zestjax.apps.evaluate import Renderer, device_name
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, score_image
-from zestjax.apps.weights import at_precision, open_weights
+from zestjax.apps.weights import arithmetic, at_precision, open_weights
 from zestjax.io.files import write_bytes
 from zestjax.precision import PRECISIONS
 from zestjax.simulate.clips import training_clip
@@ -59,7 +59,7 @@ def gradient(model, batch):
 
 
 def measured(options):
-    """One row a precision; float64 is last, as it switches the process to 64 bits."""
+    """One row a precision; float64, the exact one, is last."""
     model, rows, kept = open_weights(), [], []
     clip = training_clip(jax.random.key(options.seed), height=model.config.height, width=model.config.width)
     batch = batches.batch_from_clip(
@@ -67,8 +67,9 @@ def measured(options):
     )
     for precision in PRECISIONS:
         chosen = at_precision(model, precision)
-        mean, colours, depths, frame, compiling = views(chosen, options)
-        grads, step = gradient(chosen, batch)
+        with arithmetic(precision):
+            mean, colours, depths, frame, compiling = views(chosen, options)
+            grads, step = gradient(chosen, batch)
         kept.append((colours, depths, grads))
         rows.append({"precision": precision, "mean": mean, "seconds_per_frame": frame, "seconds_per_step": step,
                      "compile_seconds": compiling})  # fmt: skip

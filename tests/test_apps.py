@@ -11,9 +11,7 @@ import stage
 
 from zestjax.apps import paths, scoring, stereo, tables, train
 from zestjax.apps.host import host_camera, host_video
-from zestjax.apps.scenes import Opened
 from zestjax.cameras import Camera, project, rigid_inverse, unproject
-from zestjax.io.scenes import Scene
 
 
 def test_the_stereo_pair_agrees_with_its_calibration():
@@ -159,13 +157,11 @@ def test_a_bad_path_says_what_it_should_be(tmp_path, video):
         paths.camera_path(str(tmp_path / "late.npz"), video)
 
 
-def test_scenes_are_learned_from_in_turn_each_from_its_own_frames(monkeypatch):
+def test_scenes_are_learned_from_in_turn_each_from_its_own_frames():
     dark = stage.video()._replace(images=0.5 * stage.video().images)
     shown = {"light": stage.video(), "dark": dark}
-    opened = lambda name, config, *, protocol: Opened(Scene(name, shown[name], ()), None)
-    monkeypatch.setattr(train, "open_scene", opened)
     options = train.TrainOptions(Path("unused"), scenes=("light", "dark"))
-    with train.batches(stage.MINI, options) as batch_at:
+    with train.batches(stage.MINI, options, tuple(shown.values())) as batch_at:
         found = [batch_at(step) for step in range(4)]
     brightest = [float(np.max(batch.inputs.key.images)) for batch in found]
     assert max(brightest[1::2]) <= 0.5 < min(brightest[::2])

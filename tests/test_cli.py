@@ -1,20 +1,27 @@
 """The commands: what they write, and one clear line for every kind of bad input."""
 
 import dataclasses
+import io
 import json
+import os
+from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from zestjax import novel_view
-from zestjax.apps import frontier
+from zestjax.apps import cache, frontier
 from zestjax.apps.host import host_camera, host_video
-from zestjax.apps.weights import open_weights, system_of
+from zestjax.apps.producer import ProducerError
+from zestjax.apps.train import TrainOptions, fresh
+from zestjax.apps.weights import arithmetic, open_weights, system_of
 from zestjax.cli import main
 from zestjax.io.nsff import write_nsff
 from zestjax.io.scenes import Target
+from zestjax.io.video import read_video
 from zestjax.io.weights import save_weights
 from zestjax.model import init_params
 from zestjax.novel_view import View
@@ -205,7 +212,7 @@ def test_a_full_disk_is_one_line(places, grey, capsys, monkeypatch):
     def full(path, content):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr("zestjax.apps.evaluate.write_bytes", full)
+    monkeypatch.setattr("zestjax.apps.results.write_bytes", full)
     refused(capsys, run(places, "evaluate", "--no-pictures", "--quiet"), "No space left", "free some space")
 
 
@@ -214,3 +221,135 @@ def test_a_target_camera_that_sees_nothing_is_refused(places, grey, capsys, tmp_
     away[0, 0] = away[2, 2] = -1
     np.savez(tmp_path / "away.npz", intrinsics=camera(0).intrinsics[None], camera_from_world=away[None], times=[0])
     refused(capsys, run(places, "render", "--path", str(tmp_path / "away.npz")), "sees nothing")
+
+
+def test_frames_are_those_of_the_last_run_and_what_no_record_names_stays(places, grey):
+    out = places / "out/again"
+    (out / "frames").mkdir(parents=True)
+    (out / "frames/of_mine.png").write_text("mine")
+    for count in (5, 2):
+        assert run(places, "render", "--frames", str(count), "--quiet", "--out", str(out)) == 0
+        names = {path.name for path in (out / "frames").iterdir()}
+        assert names == {"of_mine.png", *(f"{i:05d}.png" for i in range(count))}
+    for targets in ("1,4", "4"):
+        assert run(places, "evaluate", "--quiet", "--targets", targets, "--out", str(places / "out/twice")) == 0
+    assert [path.name for path in (places / "out/twice/pictures").iterdir()] == ["00004_cam02.png"]
+
+
+def test_an_interrupted_render_keeps_its_frames_and_the_next_run_removes_them(places, grey, monkeypatch, capsys):
+    shown, asked = novel_view.render_view, []
+
+    def stopping(*arguments, **options):
+        asked.append(1)
+        if len(asked) == 4:
+            raise KeyboardInterrupt
+        return shown(*arguments, **options)
+
+    out = places / "out/stopped"
+    with monkeypatch.context() as patch:
+        patch.setattr(novel_view, "render_view", stopping)
+        assert run(places, "render", "--frames", "6", "--quiet", "--out", str(out)) == 1
+    assert capsys.readouterr().err == "error: interrupted\n"
+    assert len(list((out / "frames").iterdir())) == 3
+    assert run(places, "render", "--frames", "2", "--quiet", "--out", str(out)) == 0
+    assert len(list((out / "frames").iterdir())) == 2
+
+
+def test_names_are_printed_whatever_letters_they_have(places, grey, tmp_path):
+    latin = os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9:1")
+    flags = ["--weights", str(places / "tiny.safetensors"), "--frames", "2", "--path", "frames"]
+    ascii_out = io.TextIOWrapper(io.BytesIO(), "ascii")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.stdout", ascii_out)
+        assert main(["render", "--scene", str(places / "scene"), *flags, "--out", latin]) == 0
+    ascii_out.seek(0)
+    assert ascii_out.read().rstrip().endswith("/caf\\udce9:1/video.webm")
+    assert read_video(f"{latin}/video.webm").shape == (2, HEIGHT, WIDTH, 3)
+
+
+@pytest.mark.parametrize("command", ["evaluate", "render", "finetune", "frontier", "train", "simulate"])
+def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(command, places, capsys, tmp_path):
+    (tmp_path / "file").write_text("x")
+    flags = {"train": [], "simulate": ["--scene", "walker"]}.get(command, ["--scene", str(places / "scene")])
+    for out in ("file", "file/under"):
+        refused(
+            capsys, main([command, *flags, "--out", str(tmp_path / out)]), out, "a file lies where", "another place"
+        )
+    assert (tmp_path / "file").read_text() == "x"
+
+
+def test_an_imported_file_is_not_a_folder(capsys, tmp_path):
+    refused(capsys, main(["import-mvsnerf", "x.tar", "--out", str(tmp_path)]), "is a folder", "give the file")
+
+
+@pytest.mark.parametrize(
+    "error, code, words",
+    [
+        (MemoryError(), 2, "MemoryError: the input is too large"),
+        (RecursionError("too deep"), 2, "too deep: the input is"),
+        (ProducerError("it was ended by SIGKILL"), 1, "ended by SIGKILL"),
+        (jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED:\nno memory"), 1, "RESOURCE_EXHAUSTED: no memory"),
+        (OSError(30, "Read-only file system", "d/f"), 2, "d/f: Read-only file system; choose a place that can be"),
+    ],
+)
+def test_every_expected_error_is_one_line(error, code, words, monkeypatch, capsys):
+    def fail(options):
+        raise error
+
+    monkeypatch.setattr("zestjax.cli._run_doctor", fail)
+    assert main(["doctor"]) == code
+    said = capsys.readouterr().err
+    assert words in said and said.startswith("error: ") and said.count("\n") == 1
+
+
+def test_an_interrupted_run_prints_the_whole_command_that_goes_on(monkeypatch, capsys):
+    from zestjax.apps import finetune
+
+    stopped = SimpleNamespace(line="finetune: 3 steps", result=SimpleNamespace(finished=False))
+    monkeypatch.setattr(finetune, "finetune", lambda options: stopped)
+    given = ["finetune", "--scene", "a scene", "--out", "out", "--size", "32x48"]
+    for command in (given, [*given, "--resume"]):
+        assert main(command) == 1
+        expected = "finetune: 3 steps; go on with: zestjax finetune --scene 'a scene' --out out --size 32x48 --resume\n"
+        assert capsys.readouterr().out == expected
+
+
+@pytest.mark.parametrize("started", [True, False])
+def test_weights_are_float32_whatever_jax_was_started_with(places, started):
+    with jax.enable_x64(started):
+        model = open_weights(places / "tiny.safetensors")
+        with arithmetic("float64"):
+            assert jnp.result_type(float) == jnp.float64
+        with arithmetic():
+            state, _ = fresh(preset("tiny"), TrainOptions(places / "unused", preset="tiny"))
+    for tree in (model.params, state.params):
+        assert {leaf.dtype for leaf in jax.tree.leaves(tree)} == {jnp.dtype("float32")}
+
+
+def test_two_evaluations_in_one_process_may_differ_in_precision(places, grey):
+    for flags in (["--precision", "float64"], [], ["--precision", "bfloat16"]):
+        with jax.numpy_dtype_promotion("standard"):  # as users have it: 64-bit JAX counts in int64
+            assert run(places, "evaluate", "--quiet", "--no-pictures", *flags) == 0
+        assert jnp.result_type(float) == jnp.float32
+
+
+def test_without_a_home_the_cache_is_a_private_temporary_folder(monkeypatch, tmp_path):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "t"))
+    (tmp_path / "t").mkdir()
+    (tmp_path / "home").write_text("no folder")
+
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    for home in (no_home, lambda: tmp_path / "home"):
+        cache._private_folder.cache_clear()
+        monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+        monkeypatch.setattr("pathlib.Path.home", home)
+        folder = cache.cache_folder()
+        assert folder == tmp_path / f"t/zestjax-{os.getuid()}" and folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o777)
+    cache._private_folder.cache_clear()
+    assert cache.cache_folder() != folder
+    cache._private_folder.cache_clear()
+    monkeypatch.setattr("pathlib.Path.home", lambda: tmp_path)
+    assert cache.cache_folder() == tmp_path / ".cache/zestjax"

@@ -3,6 +3,7 @@
 # pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false, reportCallIssue=false
 
 import os
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -121,3 +122,22 @@ def test_bad_frames_and_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="is not a video"):
         video.read_video(tmp_path / "t.webp")
     assert os.listdir(tmp_path) == ["t.webp"]
+
+
+def test_opencv_is_given_no_path_of_the_users(tmp_path, monkeypatch):
+    """Native code takes `run:` for a protocol, and dies of a name that is not UTF-8."""
+    temporary = tmp_path / "zwischenablage-\N{LATIN SMALL LETTER U WITH DIAERESIS}"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    monkeypatch.chdir(tmp_path)
+    frames = moving_bar(32, 48, 3)
+    for name in ("run:1", os.fsdecode(b"caf\xe9"), "clip%05d"):
+        path = video.write_video(Path(name) / "film", frames)
+        assert path.suffix == ".webm" and video.read_video(path).shape == (3, 32, 48, 3)
+    assert os.listdir(temporary) == []
+
+
+def test_a_film_that_was_cut_short_by_a_full_disk_is_not_kept(tmp_path, monkeypatch):
+    encode = video._encode_webm
+    monkeypatch.setattr(video, "_encode_webm", lambda path, bgr, fps: encode(path, bgr[:-1], fps))
+    assert video.write_video(tmp_path / "film", moving_bar(32, 48, 3)).suffix == ".webp"

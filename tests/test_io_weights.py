@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import struct
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,7 @@ import pytest
 from safetensors.numpy import save
 
 from zestjax.io.checkpoints import latest_checkpoint, save_checkpoint
-from zestjax.io.files import replaced_folder, write_bytes
+from zestjax.io.files import check_writable, replaced_folder, write_bytes
 from zestjax.io.weights import DamagedFileError, WeightsError, load_weights, read_metadata, save_weights
 
 
@@ -207,3 +208,77 @@ def test_written_files_have_ordinary_permissions(tmp_path):
     write_bytes(tmp_path / "a", b"x")
     (tmp_path / "b").write_bytes(b"x")
     assert (tmp_path / "a").stat().st_mode == (tmp_path / "b").stat().st_mode
+
+
+def fill(place, content):
+    with replaced_folder(place, marker="mark") as fresh:
+        (fresh / "mark").write_text(content)
+        (fresh / content).mkdir()
+
+
+def test_a_folder_behind_a_link_is_replaced_and_the_link_stays(tmp_path):
+    (tmp_path / "disk").mkdir()
+    for name, target in (("link", "disk"), ("dangling", "later")):
+        (tmp_path / name).symlink_to(target)
+        for content in ("first", "second"):
+            fill(tmp_path / name, content)
+        assert (tmp_path / name).is_symlink() and sorted(os.listdir(tmp_path / target)) == ["mark", "second"]
+        write_bytes(tmp_path / name / "more", b"x")
+        assert (tmp_path / target / "more").read_bytes() == b"x"
+    assert sorted(os.listdir(tmp_path)) == ["dangling", "disk", "later", "link"]
+
+
+@pytest.mark.parametrize("why", ["where the process stands", "mount point", "unwritable parent"])
+def test_a_folder_that_cannot_be_renamed_has_its_entries_replaced(tmp_path, monkeypatch, why):
+    place, access = tmp_path / "scene", os.access
+    place.mkdir()
+    if why == "where the process stands":
+        monkeypatch.chdir(place)
+    elif why == "mount point":
+        monkeypatch.setattr(os.path, "ismount", lambda path: path == place)
+    else:
+        monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path and access(path, mode))
+    number = place.stat().st_ino
+    (place / ".scene.killed.part").mkdir()
+    for content in ("first", "second"):
+        fill(Path(".") if why == "where the process stands" else place, content)
+    assert sorted(os.listdir(place)) == ["mark", "second"] and place.stat().st_ino == number
+    rename = Path.rename
+
+    def full(source, target):
+        if source.name == "third":
+            raise OSError(28, "No space left on device")
+        return rename(source, target)
+
+    monkeypatch.setattr(Path, "rename", full)
+    with pytest.raises(OSError, match="nothing was changed there"):
+        fill(place, "third")
+    assert sorted(os.listdir(place)) == ["mark", "second"] and (place / "mark").read_text() == "second"
+
+
+@pytest.mark.parametrize(
+    "number, words",
+    [(28, "free some space"), (122, "free some space"), (30, "that can be written to"), (13, "that can be written to"),
+     (36, "shorter name"), (20, "a file lies where a folder is needed"), (5, "another place")],
+)  # fmt: skip
+def test_every_error_of_the_disk_says_once_what_to_do(tmp_path, monkeypatch, number, words):
+    def fail(*_):
+        raise OSError(number, "failed")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError) as caught, replaced_folder(tmp_path / "scene", marker="mark") as fresh:
+        write_bytes(fresh / "images/0.png", b"x")
+    assert str(caught.value).count(words) == 1 and caught.value.filename == str(tmp_path / "scene")
+    with pytest.raises(OSError, match="this file was not written"):
+        write_bytes(tmp_path / "0.png", b"x")
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_place_is_tried_without_being_made(tmp_path):
+    check_writable(tmp_path / "a/b")
+    (tmp_path / "link").symlink_to("nowhere/at/all")
+    check_writable(tmp_path / "link")
+    assert os.listdir(tmp_path) == ["link"]
+    for out, words in (("/proc/1/x", "Permission denied|Read-only|No such"), ("/dev/null/x", "Not a directory")):
+        with pytest.raises(OSError, match=words):
+            check_writable(out)

@@ -196,3 +196,13 @@ def test_an_update_can_be_differentiated_also_where_a_parameter_has_no_gradient(
 
     for slope in (jax.jacfwd(after), jax.jacrev(after)):
         assert np.isfinite(slope(jnp.float32(0.5)))
+
+
+def test_adam_takes_numbers_of_pythons_and_names_what_has_no_gradient():
+    solver = solve.Adam(learning_rate=0.1)
+    params = {"a": 1.0, "b": jnp.ones(2)}
+    state = solver.init_state(params)
+    params, state = solver.apply(params, state, {"a": 2.0, "b": jnp.ones(2)}, jnp.float32(1))
+    assert params["a"] == pytest.approx(0.9, abs=1e-6) and params["a"].dtype == jnp.float32
+    with pytest.raises(TypeError, match=r"leaf `\['n'\]` is int32"):
+        solver.init_state({"n": 3})

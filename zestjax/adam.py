@@ -33,6 +33,20 @@ def moment_dtype(x):
     return jnp.float64 if x.dtype == jnp.float64 else jnp.float32
 
 
+def _arrays(tree):
+    """The tree with numbers of Python's as arrays.
+
+    Raises:
+      TypeError: a leaf that is no floating-point number has no gradient.
+    """
+    tree = jax.tree.map(lambda leaf: leaf if hasattr(leaf, "dtype") else jnp.asarray(leaf), tree)
+    for path, leaf in jax.tree.leaves_with_path(tree):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            name = jax.tree_util.keystr(path) or "the tree"
+            raise TypeError(f"Adam: leaf `{name}` is {leaf.dtype}, expected a floating type; keep it out of the tree.")
+    return tree
+
+
 def init_adam(params, *, value_dtype=None, aux=None):
     """The state before the first update.
 
@@ -45,6 +59,7 @@ def init_adam(params, *, value_dtype=None, aux=None):
     Returns:
       `AdamState`; no two leaves share a buffer, so it may be donated.
     """
+    params = _arrays(params)
     zeros = lambda: jax.tree.map(lambda p: jnp.zeros(p.shape, moment_dtype(p)), params)
     count = lambda: jnp.zeros((), jnp.int32)
     double = any(p.dtype == jnp.float64 for p in jax.tree.leaves(params))
@@ -81,6 +96,7 @@ def adam(params, state, grads, value, *, rate, b1=0.9, b2=0.999, eps=1e-8, clip_
     Returns:
       (params, state).
     """
+    params, grads = _arrays(params), _arrays(grads)
     finite = all_finite(grads)
     norm = jnp.where(finite, tree_norm(tree_cast(grads, state.error.dtype)), jnp.inf)
     good = finite & jnp.isfinite(value) if skip else jnp.bool_(True)

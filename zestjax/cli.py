@@ -6,7 +6,9 @@ Progress goes to standard error, one summary line to standard output; with --qui
 
 import argparse
 import errno
+import io
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -19,36 +21,86 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments=None):
     """Run one command; returns the exit code."""
-    options = vars(_parser().parse_args(arguments))
-    run, quiet = options.pop("run"), options["quiet"]
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # paths are printed whatever letters they have
+    given = sys.argv[1:] if arguments is None else arguments
+    options = vars(_parser().parse_args(given))
     try:
-        _prepare_jax()
-        line, finished = run(options)
+        return _run(options, given)
     except KeyboardInterrupt:
-        print("error: interrupted", file=sys.stderr)
-        return 1
+        return _failed("interrupted", 1)
     except OSError as error:
-        print(f"error: {_os_error(error)}", file=sys.stderr)
-        return 2
+        return _failed(_os_error(error), 2)
+    except (MemoryError, RecursionError) as error:
+        return _failed(f"{_one_line(error) or type(error).__name__}: the input is too large or nested too deeply", 2)
     except (ValueError, FloatingPointError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return _failed(_one_line(error), 2)
+    except RuntimeError as error:
+        if not _of_the_machine(error):
+            raise
+        return _failed(_one_line(error), 1)
+
+
+def _run(options, given):
+    """The exit code of a command whose flags are read; `given`: the command line, to be told when it can go on."""
+    run, quiet = options.pop("run"), options["quiet"]
+    _check_out(options)
+    _prepare_jax()
+    line, finished = run(options)
+    if not finished and "resume" in options:
+        again = [*given, *["--resume"] * (not options["resume"])]
+        line = f"{line}; go on with: {shlex.join(['zestjax', *again])}"
     if not quiet:
-        print(line)
+        print(line, flush=True)
     return 0 if finished else 1
 
 
+def _check_out(options):
+    """Refuse a place that cannot be written to before any work is done for it."""
+    from zestjax.io.files import check_writable
+
+    out = options.get("out")
+    if out is None:
+        return
+    if options.pop("out_is_file", False):
+        if out.is_dir():
+            raise ValueError(f"{out}: is a folder; give the file to write.")
+        out = out.parent
+    check_writable(out)
+
+
+def _failed(text, code):
+    print(f"error: {text}", file=sys.stderr)
+    return code
+
+
+def _one_line(error):
+    return " ".join(str(error).split())
+
+
 def _os_error(error):
+    from zestjax.io.files import WriteError, remedy
+
     where = f"{error.filename}: " if error.filename else ""
-    remedy = "; free some space, nothing half-written was left" if error.errno == errno.ENOSPC else ""
-    return f"{where}{error.strerror or error}{remedy}"
+    known = isinstance(error, WriteError) or error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+    return f"{where}{error.strerror or error}{'' if known else f'; {remedy(error.errno)}'}"
+
+
+def _of_the_machine(error):
+    """Whether an error tells of memory or of a process that ended, not of a fault in the program."""
+    import jax
+
+    from zestjax.apps.producer import ProducerError
+
+    return isinstance(error, (ProducerError, jax.errors.JaxRuntimeError))
 
 
 def _prepare_jax():
     """Compiled programs are kept in the user's cache folder, so that a command compiles once."""
     import jax
 
-    from zestjax.apps.clips import cache_folder
+    from zestjax.apps.cache import cache_folder
 
     if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
@@ -167,7 +219,7 @@ def _import_command(commands, name, about, run):
     command = commands.add_parser(name, help=about, description=about)
     command.add_argument("--out", type=Path, required=True, metavar="WEIGHTS", help="file to write (.safetensors)")
     command.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    command.set_defaults(run=run)
+    command.set_defaults(run=run, out_is_file=True)
     return command
 
 

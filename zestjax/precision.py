@@ -7,7 +7,6 @@ A network computes in the precision of its parameters (`nets.layers`), so a prec
 its own parameters in float32 and casts them inside the step: gradients and moments are float32.
 """
 
-import jax
 import jax.numpy as jnp
 
 from zestjax.trees import tree_cast
@@ -22,7 +21,7 @@ def network_at(precision, params):
     Raises:
       ValueError: float64 where JAX has it switched off.
     """
-    if precision == "float64" and not jax.config.read("jax_enable_x64"):
+    if precision == "float64" and jnp.result_type(float) != jnp.float64:
         raise ValueError(
             "network_at: precision `float64` needs 64-bit JAX: call jax.config.update('jax_enable_x64', True) first."
         )

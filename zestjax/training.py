@@ -4,7 +4,8 @@
     clip     one rendered scene: frames to read and targets to predict
 
 A step's batch is a function of (seed, n) alone, so a run that is killed and resumed computes what an uninterrupted
-one does, bit for bit on one machine. Nothing here reads a clock, prints or writes: `zestjax.apps.train` does.
+one does, bit for bit on one machine with one number of threads. Nothing here reads a clock, prints or writes:
+`zestjax.apps.train` does.
 """
 
 from typing import Any, NamedTuple
@@ -62,7 +63,8 @@ def training_steps(step_fn, state, batch_at, *, steps):
     """Runs steps `state.step` to `steps` - 1 and yields (state, info) after each.
 
     The next batch is prepared while the device computes the current step. `step_fn` may donate its arguments:
-    a yielded state is valid until the next one is asked for.
+    a yielded state is valid until the next one is asked for. A batch that cannot be made raises its error after the
+    step before it was yielded, whose state then stays valid.
 
     Args:
       step_fn: (params, opt_state, batch) -> (params, opt_state, info).
@@ -77,5 +79,11 @@ def training_steps(step_fn, state, batch_at, *, steps):
     while state.step < steps:
         params, opt_state, info = step_fn(state.params, state.opt_state, batch)
         state = TrainState(params, opt_state, state.step + 1)
-        batch = batch_at(state.step) if state.step < steps else None
+        failed = None
+        try:
+            batch = batch_at(state.step) if state.step < steps else None
+        except Exception as error:
+            failed = error
         yield state, scalars(info)
+        if failed is not None:
+            raise failed

@@ -2,27 +2,30 @@
 
     python -m zestjax.apps.clips --out DIR [--seed S] [--size HxW] [--count N]
 
-fills a folder ahead of a run. A trainer asks its own producer for what is missing: one line of clip indices on the
-producer's standard input, in the order they are wanted. The input closes with the trainer, however it ends, and the
-producer with the input. Clip i of seed s is a function of (s, i) and of the simulator's code alone.
+fills a folder ahead of a run; `zestjax.apps.producer` runs it beside a trainer. Clip i of seed s is a function of
+(s, i) and of the simulator's code alone.
+
+origin   what a clip is a function of, as text; it is stored with the clip and compared when it is read
 """
 
 import argparse
-import contextlib
 import functools
 import hashlib
 import io
 import os
-import subprocess
 import sys
-import time
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from zestjax.apps.cache import cache_folder
 from zestjax.io.files import write_bytes
 
+ORIGIN = "origin"
+_BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 EVIDENCE = "evidence_"
 """Before the names of the evidence's arrays, which share a dict with the clip's."""
 
@@ -37,11 +40,6 @@ class ClipSpec(NamedTuple):
     frames: int = 16
     targets: int = 8
     planes: int = 0
-
-
-def cache_folder():
-    """The user's cache folder of zestjax."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "zestjax"
 
 
 def clip_folder(spec, *, root=None):
@@ -63,7 +61,11 @@ def evidence_folder(folder, planes):
 def _code(*patterns):
     """Eight digits that change with the source files of the package that match; read once, as the code itself is."""
     package = Path(__file__).parents[1]
-    sources = [path for pattern in patterns for path in sorted(package.glob(pattern))]
+    found = [sorted(package.glob(pattern)) for pattern in patterns]
+    if not all(found):
+        missing = [pattern for pattern, paths in zip(patterns, found, strict=True) if not paths]
+        raise ValueError(f"{package}: has no {', '.join(missing)}, which tells clips apart; install zestjax again.")
+    sources = [path for paths in found for path in paths]
     return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
 
 
@@ -72,25 +74,37 @@ def clip_path(folder, index):
     return Path(folder) / f"clip-{index:06d}.npz"
 
 
-def read_clip(path):
+def origin_of(spec, index):
+    """What clip `index` of a spec is a function of, and so its evidence in the folder that names how it is found."""
+    size = f"{spec.height}x{spec.width}, {spec.frames}+{spec.targets} frames"
+    return f"clip {index} of seed {spec.seed}, {size}, simulator {_code('simulate/*.py')}"
+
+
+def read_clip(path, origin):
     """A clip's arrays by name.
 
     Raises:
-      ValueError: the file is damaged.
+      ValueError: the file is damaged, or holds what has another origin.
+      FileNotFoundError: there is none.
     """
     try:
         with np.load(path) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, KeyError) as error:
+            arrays = {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, EOFError, LookupError, TypeError, AttributeError, *_BROKEN_ZIP) as error:
         if isinstance(error, FileNotFoundError):
             raise
-        raise ValueError(f"{path}: is not a readable clip ({error}); delete it, it is rendered again.") from error
+        raise ValueError(f"{path}: is not a readable clip ({error}); delete it.") from error
+    found = str(arrays.pop(ORIGIN, "a clip of an earlier version"))
+    if found != origin:
+        raise ValueError(f"{path}: holds {found}, expected {origin}; delete it.")
+    return arrays
 
 
-def write_clip(path, arrays):
+def write_clip(path, arrays, origin):
     """Write arrays by name, atomically; those that are None are left out."""
     buffer = io.BytesIO()
     known: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
+    known[ORIGIN] = np.array(origin)
     np.savez(buffer, **known)
     write_bytes(path, buffer.getvalue())
 
@@ -108,17 +122,28 @@ def render_clip(spec, index):
 def make_clip(spec, folder, index):
     """Render clip `index` and find its evidence, those that `folder` lacks."""
     path, found = clip_path(folder, index), clip_path(evidence_folder(folder, spec.planes), index)
-    if not path.exists():
-        write_clip(path, render_clip(spec, index)._asdict())
     if spec.planes and not found.exists():
         from zestjax.batches import clip_from_arrays, prepare_clip
         from zestjax.presets import preset
 
-        clip, key = clip_from_arrays(read_clip(path)), hole_key(spec.seed, index)
+        clip, key = clip_from_arrays(_clip_arrays(spec, path, index)), hole_key(spec.seed, index)
         prepared = prepare_clip(key, clip, preset("small", evidence_planes=spec.planes))
         assert prepared.evidence is not None  # of the preset's encoder
         evidence = {f"{EVIDENCE}{name}": array for name, array in prepared.evidence._asdict().items()}
-        write_clip(found, evidence | {"holes": np.array(prepared.holes, int)})
+        write_clip(found, evidence | {"holes": np.array(prepared.holes, int)}, origin_of(spec, index))
+    if not path.exists():
+        _clip_arrays(spec, path, index)
+
+
+def _clip_arrays(spec, path, index):
+    """The arrays of clip `index`, rendered and written if its file is missing, damaged or another clip's."""
+    origin = origin_of(spec, index)
+    try:
+        return read_clip(path, origin)
+    except (FileNotFoundError, ValueError):
+        arrays = {name: np.asarray(v) for name, v in render_clip(spec, index)._asdict().items() if v is not None}
+        write_clip(path, arrays, origin)
+        return arrays
 
 
 def hole_key(seed, index):
@@ -128,110 +153,10 @@ def hole_key(seed, index):
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), index), 1)
 
 
-class Producer:
-    """A process that renders the clips it is asked for; a context that ends it."""
-
-    def __init__(self, spec, folder):
-        self.folder = Path(folder)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self.folders = (self.folder, evidence_folder(folder, spec.planes)) if spec.planes else (self.folder,)
-        size, counts = f"{spec.height}x{spec.width}", ["--frames", str(spec.frames), "--targets", str(spec.targets)]
-        counts += ["--planes", str(spec.planes)]
-        command = [sys.executable, "-m", "zestjax.apps.clips", "--follow", "--out", str(folder), "--size", size]
-        environment = os.environ | {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1"}
-        self.log = (self.folder / f"producer-{os.getpid()}.log").open("w+")
-        self.process = subprocess.Popen(
-            [*command, "--seed", str(spec.seed), *counts],
-            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self.log, text=True, env=environment,
-            start_new_session=True,
-        )  # fmt: skip
-        assert self.process.stdin is not None
-        self.asked = self.process.stdin
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.process.kill()
-        self.process.wait()
-        with contextlib.suppress(OSError):
-            self.asked.close()
-        self.log.close()
-        Path(self.log.name).unlink(missing_ok=True)
-
-    def paths(self, index):
-        """The files of clip `index`; the last is written last."""
-        return [clip_path(folder, index) for folder in self.folders]
-
-    def ask(self, indices):
-        """Have these clips rendered, in this order, those that exist left out."""
-        missing = [str(index) for index in indices if not all(path.exists() for path in self.paths(index))]
-        if missing:
-            with contextlib.suppress(BrokenPipeError):  # `wait` reports what ended it
-                self.asked.write(" ".join(missing) + "\n")
-                self.asked.flush()
-
-    def wait(self, index):
-        """The arrays of clip `index`, once it is there.
-
-        Raises:
-          RuntimeError: the producer ended, with what it said last.
-        """
-        paths = self.paths(index)
-        while not all(path.exists() for path in paths):
-            if self.process.poll() is not None:
-                self.log.seek(0)
-                said = self.log.read().strip().splitlines()
-                raise RuntimeError(f"the process that renders clips ended: {said[-1] if said else 'no message'}")
-            time.sleep(0.02)
-        return {name: array for path in paths for name, array in read_clip(path).items()}
-
-
-class ClipSource:
-    """Clips by index, the last `alive` of them held in memory, those ahead asked for; a context."""
-
-    def __init__(self, spec, folder, *, alive, evict):
-        self.evict, self.waited, self._asked = evict, 0.0, None
-        self.producer = Producer(spec, folder)
-        self._load = functools.lru_cache(maxsize=alive)(self._read)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.producer.__exit__()
-
-    def _read(self, index):
-        try:
-            return self.producer.wait(index)
-        except ValueError:
-            for path in self.producer.paths(index):
-                path.unlink(missing_ok=True)
-            self.producer.ask([index])
-            return self.producer.wait(index)
-
-    def clip(self, index, ahead):
-        """Arrays of clip `index`; `ahead`: the indices that may be wanted soon, soonest first."""
-        ahead = tuple(ahead)
-        if ahead != self._asked:
-            self._asked = ahead
-            self.producer.ask(dict.fromkeys((index, *ahead)))
-            if self.evict:
-                self._remove_below(min(ahead, default=index))
-        start = time.perf_counter()
-        arrays = self._load(index)
-        self.waited += time.perf_counter() - start
-        return arrays
-
-    def _remove_below(self, oldest):
-        for folder in self.producer.folders:
-            for path in folder.glob("clip-*.npz"):
-                if int(path.stem.removeprefix("clip-")) < oldest:
-                    path.unlink(missing_ok=True)
-
-
 def main(arguments=None):
-    """Render clips 0 to `--count`, or those named on standard input with `--follow`."""
+    """Render clips 0 to `--count`, or those named on standard input with `--follow`; says each one's number."""
+    import jax
+
     parser = argparse.ArgumentParser(
         prog="python -m zestjax.apps.clips", description="Render training clips ahead of a run."
     )
@@ -249,11 +174,10 @@ def main(arguments=None):
     spec = ClipSpec(options.seed, height, width, options.frames, options.targets, options.planes)
     folder = Path(options.out) if options.follow else clip_folder(spec, root=options.out)
     lines = (line.split() for line in sys.stdin) if options.follow else [range(options.count)]
-    for indices in lines:
-        for index in map(int, indices):
+    with jax.enable_x64(False):
+        for index in (int(index) for indices in lines for index in indices):
             make_clip(spec, folder, index)
-            if not options.follow:
-                print(f"clip {index}", file=sys.stderr, flush=True)
+            print(index, file=sys.stdout, flush=True)
     return 0
 
 

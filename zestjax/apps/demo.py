@@ -16,7 +16,7 @@ from zestjax.apps.report import write_report
 from zestjax.apps.scenes import BENCH_SIZE, open_scene
 from zestjax.apps.scoring import number, score_depth
 from zestjax.apps.stereo import stereo_scene
-from zestjax.apps.weights import open_weights
+from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.io.files import write_bytes
 from zestjax.io.pictures import depth_picture, error_picture, share_picture, side_by_side, write_image
 from zestjax.io.scenes import Target
@@ -25,6 +25,7 @@ from zestjax.io.video import write_video
 SCENE, TIMES, FILM = "walker", (2, 8, 13, 19), 20
 
 
+@arithmetic()
 def demo(out, *, quiet=False, weights=None):
     """Run `zestjax demo`.
 

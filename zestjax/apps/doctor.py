@@ -16,7 +16,7 @@ from typing import NamedTuple
 from packaging.requirements import Requirement
 
 import zestjax
-from zestjax.apps.clips import cache_folder
+from zestjax.apps.cache import cache_folder
 from zestjax.testing.backend import backend_checks
 
 LEAST_MEMORY = 2.0  # GB: a frame of `small` at 144x256 takes 1.1, training it 2

@@ -5,7 +5,6 @@ what is done once for a video (`prepare`) and the compile stand beside them.
 """
 
 import dataclasses
-import json
 import time
 from pathlib import Path
 
@@ -14,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax import floors, mvsnerf, novel_view
+from zestjax.apps import results
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
 from zestjax.apps.tables import headline, write_table
-from zestjax.apps.weights import PUBLISHED, at_precision, open_weights, standing_still
+from zestjax.apps.weights import PUBLISHED, arithmetic, at_precision, open_weights, standing_still
 from zestjax.inputs import check_target
-from zestjax.io.files import write_bytes
 from zestjax.io.lpips import load_lpips
 from zestjax.io.pictures import depth_picture, error_picture, share_picture, side_by_side, write_image
 
@@ -58,6 +57,11 @@ def evaluate(options):
     """
     model = open_weights(options.weights, system=options.system, published=True)
     model = at_precision(model, options.precision)
+    with arithmetic(options.precision):
+        return _evaluate(model, options)
+
+
+def _evaluate(model, options):
     if options.scene != "bench:all":
         report = evaluate_scene(model, options, Path(options.out))
         return f"evaluate: {headline(report)}: {Path(options.out) / 'metrics.json'}"
@@ -86,6 +90,8 @@ def score_scene(view_of, opened, options, out):
     """Score an opened scene's targets with its `Renderer`; see `evaluate_scene`."""
     scene, model, rows = opened.scene, view_of.model, []
     lpips = None if options.lpips is None else load_lpips(options.lpips)
+    planned = [{"file": picture_name(target)} for target in scene.targets if options.pictures]
+    results.begin(out / "metrics.json", picture_names, {"scene": scene.name, "unfinished": True, "targets": planned})
     for target in progress(scene.targets, scene.name, quiet=options.quiet):
         check_target(scene.name, scene.video, target.camera)
         shown = out if options.pictures else None
@@ -98,8 +104,19 @@ def score_scene(view_of, opened, options, out):
         **summary(rows), "prepare_seconds": number(view_of.prepare_seconds),
         "compile_seconds": number(view_of.compile_seconds), "targets": [row["row"] for row in rows],
     }  # fmt: skip
-    write_bytes(out / "metrics.json", (json.dumps(report, indent=1) + "\n").encode())
+    results.write_record(out / "metrics.json", report)
     return report
+
+
+def picture_name(target):
+    """A target's picture beside metrics.json."""
+    return f"pictures/{target.time:05d}_{target.camera_name}.png"
+
+
+def picture_names(told):
+    """The pictures that a `metrics.json` tells of."""
+    targets = told.get("targets")
+    return [row.get("file") for row in targets if isinstance(row, dict)] if isinstance(targets, list) else []
 
 
 class Renderer:
@@ -143,7 +160,7 @@ def evaluate_target(view_of, scene, target, ceiling, out, lpips=None):
     nearest, warped = floor_images(view_of.video, target)
     score = lambda image: score_image(image, target.image, target.dynamic, lpips=lpips)
     limit = None if ceiling is None else ceiling(target)
-    name = f"pictures/{target.time:05d}_{target.camera_name}.png"
+    name = picture_name(target)
     if out is not None:
         write_image(out / name, picture_of(nearest, view, target, scene.video))
     row = {

@@ -6,7 +6,6 @@ moves would learn to fade. It is therefore left out, as far as the frames' own a
 
 import dataclasses
 import functools
-import hashlib
 from pathlib import Path
 
 import cv2
@@ -17,9 +16,9 @@ import numpy as np
 from zestjax import novel_view
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
-from zestjax.apps.scenes import open_scene
+from zestjax.apps.scenes import digest, open_scene, place_of
 from zestjax.apps.train import run_name, summarise
-from zestjax.apps.weights import open_weights
+from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.learn import find_fault, make_train_step
 from zestjax.losses.objective import Terms
 from zestjax.measures import measurable
@@ -29,6 +28,7 @@ RATE = 1e-3
 STILL_WEIGHTS = Terms(static_rec=20.0)
 MOVING = 0.3  # probability of moving from which a pixel is left out, and its surroundings with it
 FOREVER = 1_000_000
+CHECKPOINT_SECONDS = 60.0  # the default budget: a run that asks for more loses at most this much to a kill
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +48,7 @@ class FinetuneOptions:
     quiet: bool = False
 
 
+@arithmetic()
 def finetune(options):
     """Run `zestjax finetune`.
 
@@ -69,24 +70,16 @@ def finetune(options):
     init, step_fn = make_train_step(model.config, steps=FOREVER, weights=weights, peak=RATE, floor=RATE, warmup=5)
     explain = functools.partial(find_fault, config=model.config, weights=weights)
     params = jax.tree.map(jnp.array, model.params)  # copies: the step donates
-    loop = LoopOptions(options.out, options.steps, options.budget, options.resume, 60.0, quiet=options.quiet)
+    loop = LoopOptions(
+        options.out, options.steps, options.budget, options.resume, CHECKPOINT_SECONDS, quiet=options.quiet
+    )
     metadata = model.metadata | {
-        "seed": options.seed, "start": run_name(model.path), "scene": str(options.scene),
+        "seed": options.seed, "start": run_name(model.path), "scene": place_of(options.scene),
         "data": {"frames": digest(video), "exclude": list(options.exclude)},
     }  # fmt: skip
     batch_at = frame_batches(video, model.config, seed=options.seed, exclude=options.exclude, moving=moving)
     result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "finetune")
-
-
-def digest(video):
-    """What tells one scene's frames, cameras and size from another's, wherever they lie."""
-    found = hashlib.sha256()
-    for leaf in jax.tree.leaves(video):
-        array = np.ascontiguousarray(leaf)
-        found.update(f"{array.shape} {array.dtype}".encode())
-        found.update(array.tobytes())
-    return found.hexdigest()[:12]
 
 
 def moving_pixels(model, video, exclude):

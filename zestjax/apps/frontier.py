@@ -18,7 +18,7 @@ from zestjax.apps.progress import progress
 from zestjax.apps.render import scaled_video
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, score_image
-from zestjax.apps.weights import open_weights
+from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.cameras import resized
 from zestjax.io.files import write_bytes
 from zestjax.io.pictures import resize_area
@@ -67,6 +67,7 @@ def settings_of(config):
     return [*tried, Setting(f"{planes // 2} planes, 0.75 of the size", less, 0.75)]
 
 
+@arithmetic()
 def frontier(options):
     """Run `zestjax frontier`.
 

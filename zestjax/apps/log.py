@@ -3,7 +3,6 @@
 A line holds step, seconds (of stepping so far), seconds_per_step, and the mean of every scalar the steps reported.
 """
 
-import contextlib
 import io
 import json
 import math
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from zestjax.io.files import write_bytes
+from zestjax.io.files import append_bytes, write_bytes
 
 PATIENCE = 50  # steps in a row whose loss may be non-finite before the run gives up
 CLOCK = ("step", "seconds", "seconds_per_step")
@@ -49,9 +48,8 @@ class Recorder:
             "seconds": round(seconds, 2),
             "seconds_per_step": round(spent / len(self.kept), 4),
         } | means
+        append_bytes(self.path, (json.dumps(self.last) + "\n").encode())
         self.mark, self.kept = seconds, []
-        with self.path.open("a") as file:
-            file.write(json.dumps(self.last) + "\n")
 
     def draw(self, path, *, least_seconds=60.0):
         """Draw the curves so far, unless they were less than `least_seconds` ago."""
@@ -62,25 +60,47 @@ class Recorder:
 
 
 def read_log(path):
-    """The lines of a log as dicts; a last line cut short by a crash is left out."""
-    lines = []
-    for text in Path(path).read_text().splitlines() if Path(path).exists() else []:
-        with contextlib.suppress(json.JSONDecodeError):
-            lines.append(json.loads(text))
-    return lines
+    """The lines of a log that are records of a step, and how many are not.
+
+    Args:
+      path: the log; none is an empty one. A last line that a crash cut short is neither kept nor counted.
+
+    Returns:
+      (list of dict, int).
+    """
+    if not Path(path).exists():
+        return [], 0
+    whole = Path(path).read_bytes().split(b"\n")[:-1]
+    lines = [line for text in whole if (line := _record(text)) is not None]
+    return lines, len(whole) - len(lines)
+
+
+def _record(text):
+    """A line's dict, or None if it is no record of a step."""
+    try:
+        line = json.loads(text.decode("utf-8"))
+    except (ValueError, RecursionError):
+        return None
+    return line if isinstance(line, dict) and type(line.get("step")) is int else None
 
 
 def cut_log(path, step):
-    """Forget what was logged after the checkpoint that a run resumes from."""
-    kept = [line for line in read_log(path) if line["step"] <= step]
+    """Forget what was logged after the checkpoint that a run resumes from, and what is no record.
+
+    Returns:
+      int, how many lines were no record.
+    """
+    lines, dropped = read_log(path)
+    kept = [line for line in lines if line["step"] <= step]
     write_bytes(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
+    return dropped
 
 
 def draw_curve(log, path):
     """The logged scalars against the step, smoothed, one small plot each, as a PNG."""
     from matplotlib.figure import Figure
 
-    lines = read_log(log)
+    lines = [_numbers(line) for line in read_log(log)[0]]
     names = [n for n in dict.fromkeys(n for line in lines for n in line) if n not in CLOCK]
     if not names:
         return
@@ -98,3 +118,8 @@ def draw_curve(log, path):
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     write_bytes(path, buffer.getvalue())
+
+
+def _numbers(line):
+    """A record without what cannot be drawn."""
+    return {name: value for name, value in line.items() if type(value) in (int, float)}

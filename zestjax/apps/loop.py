@@ -15,13 +15,12 @@ from typing import NamedTuple
 
 from tqdm import tqdm
 
-from zestjax.apps.log import Recorder, cut_log
-from zestjax.io.checkpoints import latest_checkpoint, save_checkpoint
-from zestjax.io.weights import WeightsError, save_weights
+from zestjax.apps import run_folder
+from zestjax.apps.log import Recorder, draw_curve, read_log
+from zestjax.io.files import append_bytes
 from zestjax.training import TrainState, training_steps
 
 MOST_FAULTS = 5  # explained in one call: each costs as much as a step
-RECIPE = ("config", "seed", "data", "stage", "peak", "start", "analysis")  # what a run that resumes must share
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,17 +42,21 @@ class LoopOptions:
 
 class LoopResult(NamedTuple):
     """state: the last `TrainState`. seconds: spent stepping, over all resumed parts. compile_seconds: of this call's
-    first step. report: the last logged means. finished: whether the steps or the time were used up, not a signal."""
+    first step. report: the last logged means. finished: whether the steps or the time were used up, not a signal.
+    steps: taken by this call."""
 
     state: TrainState
     seconds: float
     compile_seconds: float
     report: dict
     finished: bool
+    steps: int
 
 
 def run_loop(step_fn, start, batch_at, options, *, metadata, explain=None):
     """Train until the steps, the seconds or a signal ends it; every file is complete whenever the process dies.
+
+    An error that ends it, but that of a loss that stays non-finite, saves the state on its way out.
 
     Args:
       step_fn: (params, opt_state, batch) -> (params, opt_state, info), may donate.
@@ -67,77 +70,62 @@ def run_loop(step_fn, start, batch_at, options, *, metadata, explain=None):
       `LoopResult`.
 
     Raises:
+      ValueError: another process trains into the folder.
       WeightsError: the folder holds another run, or a checkpoint cannot be read or written.
       FloatingPointError: the loss stays non-finite.
     """
     out = Path(options.out)
-    start, seconds = _restore(start, out, metadata) if options.resume else _start(start, out)
-    if start.step >= options.steps:
-        return LoopResult(start, seconds, 0.0, {}, True)
-    recorder = Recorder(out / "log.jsonl", options.log_steps)
-    save = lambda state, seconds: _save(out, state, metadata, seconds)
-    with _StopOnSignal() as stop, _bar(start.step, options) as bar:
-        state, clock, faults = start, _Clock(seconds, options), _Faults(out, start, explain)
-        for state, info in training_steps(step_fn, start, batch_at, steps=options.steps):
-            clock.tick()
-            recorder.add(state.step, info, clock)
-            faults.see(state, batch_at)
-            _show(bar, recorder, clock)
-            done = stop.asked or clock.over() or state.step == options.steps
-            if done or clock.checkpoint_due():
-                recorder.flush()
-                save(state, clock.seconds)
-                recorder.draw(out / "curve.png")
-            if done:
-                break
+    with run_folder.held(out):
+        begun = run_folder.restore(start, out, metadata) if options.resume else run_folder.begin(start, out)
+        out_of_time = options.seconds is not None and begun.seconds >= options.seconds
+        if begun.state.step >= options.steps or out_of_time:
+            return _ended(out, begun)
+        return _run(step_fn, begun, batch_at, options, metadata, explain)
+
+
+def _ended(out, begun):
+    """The result of a run that had already ended, its curve drawn in case it ended before that."""
+    draw_curve(out / "log.jsonl", out / "curve.png")
+    logged = read_log(out / "log.jsonl")[0]
+    return LoopResult(begun.state, begun.seconds, 0.0, logged[-1] if logged else {}, True, 0)
+
+
+def _run(step_fn, begun, batch_at, options, metadata, explain):
+    """`run_loop` from a state on, in a folder that is held."""
+    out, state, first = Path(options.out), begun.state, begun.state.step
+    recorder, clock = Recorder(out / "log.jsonl", options.log_steps), _Clock(begun.seconds, options)
+    faults = _Faults(out, state, explain)
+    with _StopOnSignal() as stop, _bar(first, options) as bar:
+        try:
+            for state, info in training_steps(step_fn, begun.state, batch_at, steps=options.steps):
+                clock.tick()
+                recorder.add(state.step, info, clock)
+                faults.see(state, batch_at)
+                _show(bar, recorder, clock)
+                done = stop.asked or clock.over() or state.step == options.steps
+                if done or clock.checkpoint_due():
+                    recorder.flush()
+                    run_folder.save(out, state, metadata, clock.seconds)
+                    recorder.draw(out / "curve.png")
+                if done:
+                    break
+        except FloatingPointError:
+            raise
+        except Exception:
+            if state.step > first:
+                _rescue(out, recorder, state, metadata, clock.seconds)
+            raise
     recorder.draw(out / "curve.png", least_seconds=0)
-    return LoopResult(state, clock.seconds, clock.compile_seconds, recorder.last, not stop.asked)
+    finished = state.step == options.steps or not stop.asked
+    return LoopResult(state, clock.seconds, clock.compile_seconds, recorder.last, finished, state.step - first)
 
 
-def _start(state, out):
-    if any((out / "checkpoints").glob("step_*.safetensors")):
-        raise WeightsError(
-            f"{out}: holds the checkpoints of an earlier run; continue it with --resume or choose another --out."
-        )
-    (out / "log.jsonl").unlink(missing_ok=True)
-    return state, 0.0
-
-
-def _restore(state, out, metadata):
-    """The newest readable checkpoint of this same run, or the fresh state when there is none yet."""
-    found = latest_checkpoint(out / "checkpoints", (state.params, state.opt_state))
-    if found is None:
-        return state, 0.0
-    for warning in found.warnings:
-        tqdm.write(f"warning: {warning} Going on from step {found.step}.", file=sys.stderr)
-    if differing := list(_differing(found.metadata["run"], metadata)):
-        raise WeightsError(
-            f"{out}: its checkpoints are of a run with another {' and '.join(differing)}; resume it with the same "
-            "command, or choose another --out."
-        )
-    cut_log(out / "log.jsonl", found.step)
-    return TrainState(found.tree[0], found.tree[1], found.step), found.metadata["seconds"]
-
-
-def _differing(before, now):
-    """Names of `RECIPE` that two runs do not share; of a dict, also of its entries."""
-    for name in RECIPE:
-        old, new = before.get(name), now.get(name)
-        if isinstance(old, dict) and isinstance(new, dict):
-            entries = [key for key in old | new if old.get(key) != new.get(key)]
-            yield from [f"{name} ({', '.join(entries)})"] if entries else []
-        elif old != new:
-            yield name
-
-
-def _save(out, state, metadata, seconds):
-    tree = (state.params, state.opt_state)
-    save_checkpoint(out / "checkpoints", state.step, tree, {"run": metadata, "seconds": seconds})
-    save_weights(
-        out / "weights.safetensors",
-        state.params,
-        metadata=metadata | {"step": state.step, "seconds": round(seconds, 1)},
-    )
+def _rescue(out, recorder, state, metadata, seconds):
+    """Save what can be saved while an error is on its way out, which is the one to be told."""
+    with contextlib.suppress(OSError):
+        recorder.flush()
+    with contextlib.suppress(Exception):  # the next step may have taken the arrays; the disk may be gone
+        run_folder.save(out, state, metadata, seconds)
 
 
 class _Faults:
@@ -157,8 +145,7 @@ class _Faults:
         self.left -= 1
         said = str(self.explain(state.params, batch_at(state.step - 1)))
         tqdm.write(f"warning: step {state.step} was skipped; {said}", file=sys.stderr)
-        with self.path.open("a") as file:
-            file.write(json.dumps({"step": state.step, "fault": said}) + "\n")
+        append_bytes(self.path, (json.dumps({"step": state.step, "fault": said}) + "\n").encode())
 
 
 class _Clock:

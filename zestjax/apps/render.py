@@ -1,26 +1,26 @@
 """`zestjax render`: a camera path through a video, as pictures and as a film."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import jax
 import numpy as np
 
+from zestjax.apps import results
 from zestjax.apps.evaluate import Renderer, device_name
 from zestjax.apps.paths import camera_path
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import number
-from zestjax.apps.weights import at_precision, open_weights, standing_still
+from zestjax.apps.weights import arithmetic, at_precision, open_weights, standing_still
 from zestjax.cameras import resized
 from zestjax.inputs import check_target
-from zestjax.io.files import write_bytes
-from zestjax.io.pictures import resize_area, write_image
+from zestjax.io.pictures import resize_area, to_bytes, write_image
 from zestjax.io.video import write_video
 
 SCALES = (1.0, 0.75, 0.5, 0.375)
 """Sizes that a time budget may fall back to; pictures are enlarged to the size asked for."""
+MOST_FRAMES = 10**6  # of a film that a `timing.json` is believed to tell of: 12 hours at 24 frames a second
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,38 +51,48 @@ def render(options):
     Raises:
       ValueError, WeightsError: a scene, a path or weights that cannot be used.
     """
+    with arithmetic(options.precision):
+        return _render(options)
+
+
+def _render(options):
     model = at_precision(open_weights(options.weights, published=True), options.precision)
     out = Path(options.out)
     scene = open_scene(options.scene, model.config, size=options.size, protocol=None, layout=options.format).scene
     model = standing_still(model) if options.still else model
     path = camera_path(options.path, scene.video, count=options.frames)
-    views, timing = render_path(model, scene, path, budget=options.budget_seconds, quiet=options.quiet)
-    pictures = np.stack([np.clip(np.asarray(view.colour, np.float32), 0, 1) for view in views])
-    size = scene.video.images.shape[1:3]
-    pictures = np.stack([resize_area(picture, *size) for picture in pictures])
-    for i, picture in enumerate(pictures):
-        write_image(out / f"frames/{i:05d}.png", picture)
-    film = write_video(out / "video", pictures, fps=options.fps)
-    timing = {
-        "scene": scene.name,
-        "path": options.path,
-        "height": size[0],
-        "width": size[1],
-        **timing,
-        "video": film.name,
-    }
-    write_bytes(out / "timing.json", (json.dumps(timing, indent=1) + "\n").encode())
+    size, count = scene.video.images.shape[1:3], len(path.times)
+    told = {"scene": scene.name, "path": options.path, "height": size[0], "width": size[1], "frames": count}
+    each, timing = render_path(model, scene, path, budget=options.budget_seconds, quiet=options.quiet)
+    pictures, seconds = [], []
+    for i, (view, spent) in enumerate(each):
+        if i == 0:
+            results.begin(out / "timing.json", frame_names, told)
+        colour = np.clip(np.asarray(view.colour, np.float32), 0, 1)
+        pictures.append(to_bytes(resize_area(colour, *size)))
+        write_image(out / f"frames/{i:05d}.png", pictures[-1])
+        seconds.append(spent)
+    film = write_video(out / "video", np.stack(pictures), fps=options.fps)
+    told |= timing(seconds) | {"video": film.name}
+    results.write_record(out / "timing.json", told)
     return (
-        f"render: {len(views)} frames of {size[0]}x{size[1]}, {timing['seconds_per_frame']:.2f} s each "
-        f"({timing['seconds']:.0f} s in all): {film}"
+        f"render: {count} frames of {size[0]}x{size[1]}, {told['seconds_per_frame']:.2f} s each "
+        f"({told['seconds']:.0f} s in all): {film}"
     )
 
 
+def frame_names(told):
+    """The files that a `timing.json` tells of."""
+    count = told.get("frames")
+    numbers = range(count) if isinstance(count, int) and count < MOST_FRAMES else ()
+    return [f"frames/{i:05d}.png" for i in numbers] + ["video.webm", "video.webp"] * bool(numbers)
+
+
 def render_path(model, scene, path, *, budget=None, quiet=False):
-    """The `View`s along a `CameraPath` and their timing; within `budget` seconds for all of them, if given.
+    """The views along a `CameraPath`, rendered as they are taken; within `budget` seconds for all of them, if given.
 
     Returns:
-      (list of `View`, dict).
+      (iterator of (`View`, seconds), function of all the seconds to a dict of timing).
 
     Raises:
       ValueError: a camera that sees nothing of what the inputs see.
@@ -90,18 +100,18 @@ def render_path(model, scene, path, *, budget=None, quiet=False):
     for index in range(len(path.times)):
         check_target(scene.name, scene.video, camera_at(path, index))
     view_of, factors = _within(model, scene.video, path, budget)
-    views, seconds = [], []
-    for index in progress(range(len(path.times)), "render", quiet=quiet):
-        view, spent = view_of(resized(camera_at(path, index), *factors), int(path.times[index]), ())
-        views.append(view)
-        seconds.append(spent)
-    each = float(np.median(seconds))  # the first one's compiling is not in it, if there are three
-    timing = {
-        "device": device_name(), "preset": model.config.name, "frames": len(views), "scale": number(factors[1]),
-        "seconds_per_frame": number(each), "first_frame_seconds": number(seconds[0]),
-        "prepare_seconds": number(view_of.first_seconds), "seconds": number(view_of.first_seconds + sum(seconds)),
-        "budget_seconds": budget,
-    }  # fmt: skip
+    view_at = lambda index: view_of(resized(camera_at(path, index), *factors), int(path.times[index]), ())
+    views = (view_at(index) for index in progress(range(len(path.times)), "render", quiet=quiet))
+
+    def timing(seconds):
+        each = float(np.median(seconds))  # the first one's compiling is not in it, if there are three
+        return {
+            "device": device_name(), "preset": model.config.name, "frames": len(seconds), "scale": number(factors[1]),
+            "seconds_per_frame": number(each), "first_frame_seconds": number(seconds[0]),
+            "prepare_seconds": number(view_of.first_seconds), "seconds": number(view_of.first_seconds + sum(seconds)),
+            "budget_seconds": budget,
+        }  # fmt: skip
+
     return views, timing
 
 

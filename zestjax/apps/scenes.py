@@ -1,5 +1,6 @@
 """A scene by the name a user gives it: a folder in any supported layout, or `bench:NAME` of zest-bench."""
 
+import hashlib
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from zestjax.apps.host import host_camera
 from zestjax.cameras import project, unproject
 from zestjax.checks import check_option
+from zestjax.io.files import resolved
 from zestjax.io.scenes import PROTOCOLS, Scene, Target, load_scene
 
 BENCH_SIZE = (144, 256)
@@ -50,6 +52,21 @@ def open_scene(name, config, *, size=None, protocol: str | None = "held-out", ta
         name, height=height, width=width, layout=layout, protocol=protocol or "strict", targets=targets, exclude=exclude
     )
     return Opened(scene, None)
+
+
+def place_of(name):
+    """Where a scene lies, for people: a run is compared by `digest`."""
+    return str(name) if str(name).startswith("bench:") else str(resolved(name))
+
+
+def digest(video):
+    """What tells one scene's frames, cameras and size from another's, wherever they lie."""
+    found = hashlib.sha256()
+    for leaf in jax.tree.leaves(video):
+        array = np.ascontiguousarray(leaf)
+        found.update(f"{array.shape} {array.dtype}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()[:12]
 
 
 def _open_bench(name, size, protocol, targets, exclude):

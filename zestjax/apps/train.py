@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 import jax
 
 import zestjax
-from zestjax.apps.clips import EVIDENCE, ClipSource, ClipSpec, clip_folder, hole_key
+from zestjax.apps.clips import EVIDENCE, ClipSpec, clip_folder, hole_key
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
-from zestjax.apps.scenes import open_scene
-from zestjax.apps.weights import SYSTEMS
+from zestjax.apps.producer import ClipSource
+from zestjax.apps.scenes import digest, open_scene, place_of
+from zestjax.apps.weights import SYSTEMS, arithmetic
 from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
 from zestjax.checks import check_option
 from zestjax.evidence import Evidence
@@ -75,6 +76,7 @@ class Summary(NamedTuple):
     result: LoopResult
 
 
+@arithmetic()
 def train(options):
     """Run `zestjax train`.
 
@@ -91,15 +93,16 @@ def train(options):
         raise ValueError("train: --stage frames learns from exact answers, which --scenes lack; drop one of them.")
     if options.stage != "all" and config.encoder != "frames":
         raise ValueError(f"train: --stage {options.stage} needs a preset whose frames are analysed; drop --stage.")
+    videos = [open_scene(name, config, protocol=None).scene.video for name in options.scenes]
+    metadata = run_metadata(config, options, videos)
     state, step_fn = fresh(config, options)
-    metadata = run_metadata(config, options)
     limit = None if options.minutes is None else 60 * options.minutes
     loop = LoopOptions(
         options.out, options.steps, limit, options.resume, 60 * options.checkpoint_minutes, quiet=options.quiet
     )
     explain = functools.partial(find_fault, config=config, weights=run_weights(config, options))
     say_left_out(config, options)
-    with batches(config, options) as batch_at:
+    with batches(config, options, videos) as batch_at:
         result = run_loop(step_fn, state, batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "train")
 
@@ -137,14 +140,15 @@ def say_left_out(config, options):
         print(f"train: this system learns without {listed}", file=sys.stderr)
 
 
-def run_metadata(config, options):
-    """Everything that makes one run's numbers differ from another's, as JSON can hold it."""
-    data: dict = {"scenes": [str(s) for s in options.scenes] or "simulated", "clip_count": options.clip_count}
+def run_metadata(config, options, videos=()):
+    """Everything that makes one run's numbers differ from another's, as JSON can hold it; `videos`: of its scenes."""
+    data: dict = {"scenes": [digest(video) for video in videos] or "simulated", "clip_count": options.clip_count}
     data |= {"window": options.window, "steps_per_clip": options.steps_per_clip}
     config = {name: list(v) if isinstance(v, tuple) else v for name, v in dataclasses.asdict(config).items()}
     return {
         "preset": options.preset, "system": options.system, "config": config, "seed": options.seed,
-        "steps": options.steps, "stage": options.stage, "peak": options.peak, "data": data,
+        "scenes": [place_of(name) for name in options.scenes], "steps": options.steps,
+        "stage": options.stage, "peak": options.peak, "data": data,
         "start": run_name(options.weights),
         "analysis": run_name(options.analysis), "zestjax": zestjax.__version__,
         "jax": jax.__version__, "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
@@ -162,29 +166,27 @@ def run_name(weights):
 
 def summarise(result, out, verb):
     """The one line on stdout."""
-    state = result.state
-    rate = result.report.get("seconds_per_step", float("nan"))
-    ended = "" if result.finished else " (interrupted; go on with the same command and --resume)"
+    state, weights = result.state, Path(out) / "weights.safetensors"
     loss = result.report.get("total")
     said = "" if loss is None else f", loss {loss:.4f}"
-    line = (
-        f"{verb}: {state.step} steps in {result.seconds:.0f} s ({rate:.2f} s a step, "
-        f"compile {result.compile_seconds:.0f} s){said}: {Path(out) / 'weights.safetensors'}{ended}"
+    rate = result.report.get("seconds_per_step", float("nan"))
+    spent = f"{rate:.2f} s a step, compile {result.compile_seconds:.0f} s" if result.steps else "nothing was left to do"
+    ended = "" if result.finished else " (interrupted)"
+    return Summary(
+        f"{verb}: {state.step} steps in {result.seconds:.0f} s ({spent}){said}: {weights}{ended}", weights, result
     )
-    return Summary(line, Path(out) / "weights.safetensors", result)
 
 
-def batches(config, options):
-    """Context: step -> batch, from simulated clips or from the scenes named."""
-    if options.scenes:
-        return contextlib.nullcontext(_scene_batches(config, options))
+def batches(config, options, videos=()):
+    """Context: step -> batch, from the videos of the scenes named, or from simulated clips."""
+    if videos:
+        return contextlib.nullcontext(_scene_batches(config, options, videos))
     return _SimulatedBatches(config, options)
 
 
-def _scene_batches(config, options):
-    """step -> batch of one of the scenes in turn, each of which is read once and kept."""
-    opened = [open_scene(name, config, protocol=None) for name in options.scenes]
-    each = [frame_batches(o.scene.video, config, seed=options.seed) for o in opened]
+def _scene_batches(config, options, videos):
+    """step -> batch of one of the scenes in turn."""
+    each = [frame_batches(video, config, seed=options.seed) for video in videos]
     return lambda step: each[step % len(each)](step // len(each))
 
 

@@ -1,5 +1,6 @@
 """Weights together with the configuration they belong to: the file carries both."""
 
+import contextlib
 import dataclasses
 from importlib import resources
 from pathlib import Path
@@ -61,6 +62,17 @@ def system_of(config):
     return next(name for name, c in SYSTEMS.items() if (c.get("geometry", True), c.get("motion", True)) == volumes)
 
 
+@contextlib.contextmanager
+def arithmetic(precision=None):
+    """Context: JAX computes in 64 bits for `float64`, else in 32, whatever the process was started with.
+
+    Weights and templates for them are made inside it: they are float32 by definition.
+    """
+    with jax.enable_x64(precision == "float64"):
+        yield
+
+
+@arithmetic()
 def open_weights(path=None, *, system=None, published=False):
     """Load weights and their configuration.
 
@@ -105,7 +117,7 @@ def standing_still(model):
 def at_precision(model, precision):
     """The `Model` run at a precision of `precision.PRECISIONS`, or, of None, as it is.
 
-    `float64` switches on 64-bit JAX for the rest of the process.
+    It must run within `arithmetic(precision)`.
 
     Raises:
       ValueError: an unknown precision, or another than float32 for MVSNeRF's weights.
@@ -115,10 +127,7 @@ def at_precision(model, precision):
     if model.system == PUBLISHED:
         check_option("--precision, of MVSNeRF's weights,", precision=(precision, ("float32",)))
         return model
-    model = model._replace(config=dataclasses.replace(model.config, precision=precision))
-    if precision == "float64":
-        jax.config.update("jax_enable_x64", True)
-    return model
+    return model._replace(config=dataclasses.replace(model.config, precision=precision))
 
 
 def import_mvsnerf(path, out, *, statistics="batch"):

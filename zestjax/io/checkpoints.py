@@ -5,6 +5,7 @@ step     how many steps the tree has seen; it is in the file's name
 """
 
 import re
+import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ class Checkpoint(NamedTuple):
     """A checkpoint read back.
 
     step: int. tree: the arrays, in the structure asked for. metadata: dict given when it was saved. path: its file.
-    warnings: one sentence for each newer checkpoint that is damaged and was passed over; normally empty.
+    warnings: one sentence for each newer checkpoint that is damaged or cannot be read and was passed over.
     """
 
     step: int
@@ -34,7 +35,7 @@ def save_checkpoint(folder, step, tree, metadata, *, keep=2):
 
     Args:
       folder: where the run's checkpoints live; made when missing.
-      step: int >= 0.
+      step: int >= 0. A folder of the file's name is moved aside.
       tree: pytree of arrays.
       metadata: dict of what JSON can hold, with the full configuration.
       keep: how many to leave, at least 1.
@@ -49,8 +50,11 @@ def save_checkpoint(folder, step, tree, metadata, *, keep=2):
     if keep < 1:
         raise ValueError(f"save_checkpoint: `keep` is {keep}, expected at least 1.")
     path = Path(folder) / f"step_{step:09d}.safetensors"
+    if path.is_dir():
+        path.rename(Path(tempfile.mkdtemp(prefix=f"not_{path.name}.", dir=folder)) / path.name)
     save_weights(path, tree, metadata=metadata)
-    for _, old in [entry for entry in _found(folder) if entry[1] != path][keep - 1 :]:
+    others = [old for _, old in _found(folder) if old != path and not old.is_dir()]
+    for old in others[keep - 1 :]:
         old.unlink(missing_ok=True)
     return path
 
@@ -63,16 +67,18 @@ def latest_checkpoint(folder, like):
       like: tree of arrays or `jax.ShapeDtypeStruct`s with the structure that was saved.
 
     Returns:
-      `Checkpoint`, whose `warnings` tell of damaged newer ones.
+      `Checkpoint`, whose `warnings` tell of newer ones that are damaged or cannot be read.
 
     Raises:
-      WeightsError: the newest whole one is of another preset, or all are damaged; nothing is removed.
+      WeightsError: the newest whole one is of another preset, or none can be read; nothing is removed.
     """
     warnings = []
     for step, path in _found(folder):
         try:
             tree, metadata = load_weights(path, like=like)
-        except DamagedFileError as error:
+        except WeightsError as error:
+            if not (isinstance(error, DamagedFileError) or isinstance(error.__cause__, OSError)):
+                raise
             warnings.append(str(error))
             continue
         return Checkpoint(step, tree, metadata, path, tuple(warnings))

@@ -1,6 +1,9 @@
 """Moving pictures that a browser plays.
 
 T        frames
+
+OpenCV's native code takes a path for a URL, and dies of names that are not UTF-8: it is only given files of a
+temporary folder, by ASCII names.
 """
 
 import contextlib
@@ -39,16 +42,17 @@ def write_video(path_stem, frames, *, fps=24):
     height, width = pixels.shape[1:3]
     padding = ((0, 0), (0, height % 2), (0, width % 2), (0, 0))
     bgr = np.ascontiguousarray(np.pad(pixels, padding, mode="edge")[..., ::-1])
-    parent = Path(path_stem).parent
-    parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".video.", dir=parent) as folder:
+    with _ascii_folder() as folder:
         for suffix, encode in ((".webm", _encode_webm), (".webp", _encode_webp)):
-            draft = Path(folder) / f"video{suffix}"
-            if encode(draft, bgr, fps) and draft.exists() and draft.stat().st_size:
+            draft = folder / f"video{suffix}"
+            if encode(draft, bgr, fps) and draft.exists() and _whole(draft, len(bgr)):
                 path = Path(f"{path_stem}{suffix}")
                 write_bytes(path, draft.read_bytes())
                 return path
-    raise OSError(f"{path_stem}: this build of OpenCV encodes neither WebM nor WebP; install its wheel from PyPI.")
+    raise OSError(
+        f"{path_stem}: this build of OpenCV encodes neither WebM nor WebP, or {tempfile.gettempdir()} is full; "
+        "install its wheel from PyPI, or set TMPDIR."
+    )
 
 
 def read_video(path):
@@ -57,20 +61,54 @@ def read_video(path):
     Raises:
       ValueError: the file is missing or not a video that OpenCV reads.
     """
-    if str(path).endswith((".webp", ".gif")):
-        done, animation = cv2.imreadanimation(str(path))
-        frames = [frame[..., 2::-1] for frame in animation.frames] if done else []
-    else:
-        capture, frames = cv2.VideoCapture(str(path)), []
-        while True:
-            done, frame = capture.read()
-            if not done:
-                break
-            frames.append(frame[..., ::-1])
-        capture.release()
+    with _ascii_folder() as folder:
+        link = folder / f"video{_suffix(path)}"
+        link.symlink_to(os.path.abspath(path))
+        frames = _decoded(link)
     if not frames:
         raise ValueError(f"{path}: is not a video that can be read; check the path and the format.")
     return np.stack(frames)
+
+
+def _suffix(path):
+    """A file's suffix, if it is ASCII."""
+    suffix = Path(path).suffix
+    return suffix if suffix.isascii() else ""
+
+
+@contextlib.contextmanager
+def _ascii_folder():
+    """Context: a temporary folder under an absolute path of ASCII letters."""
+    with tempfile.TemporaryDirectory(prefix="zestjax-") as name:
+        if name.isascii():
+            yield Path(name)
+            return
+        handle = os.open(name, os.O_RDONLY)
+        try:
+            yield Path(f"/proc/self/fd/{handle}")
+        finally:
+            os.close(handle)
+
+
+def _whole(path, count):
+    """Whether an encoder wrote all it was given: on a full disk it says nothing. WebP joins frames that are equal."""
+    found = len(_decoded(path))
+    return found == count or (found > 0 and path.suffix == ".webp")
+
+
+def _decoded(path):
+    """The frames of a file that OpenCV may be given; none of one that it cannot read."""
+    if path.suffix in (".webp", ".gif"):
+        done, animation = cv2.imreadanimation(str(path))
+        return [frame[..., 2::-1] for frame in animation.frames] if done else []
+    capture, frames = cv2.VideoCapture(str(path)), []
+    while True:
+        done, frame = capture.read()
+        if not done:
+            break
+        frames.append(frame[..., ::-1])
+    capture.release()
+    return frames
 
 
 def _encode_webm(path, bgr, fps):
