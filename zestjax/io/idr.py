@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from zestjax.cameras import Camera
-from zestjax.io.layouts import Record, as_float32, check_order, every_eighth, pictures_in
+from zestjax.io.layouts import MOST_DEPTH, Record, as_float32, check_order, every_eighth, pictures_in
 from zestjax.io.pictures import image_size
 from zestjax.io.reading import check_numbers, read_arrays, visible
 
@@ -102,7 +102,7 @@ def _bounds(source, cameras, sphere):
     middle = np.concatenate([sphere[:, :3, 3], np.ones((len(sphere), 1))], -1)
     depth, radius = np.einsum("nij,nj->ni", cameras.camera_from_world, middle)[:, 2], sphere[:, 0, 0]
     near, far = float((depth - radius).min()), float((depth + radius).max())
-    if not 0 < near < far:
+    if not 0 < near < far < MOST_DEPTH:
         raise ValueError(
             f"{source}: a camera stands inside the sphere of scale_mat_i (or looks away); its bounds fail."
         )

@@ -17,6 +17,7 @@ from zestjax.cameras import Camera
 from zestjax.io.pictures import SUFFIXES
 from zestjax.io.reading import in_order, numbers_of, visible
 
+MOST_DEPTH = 1e30  # of a bound: float32 holds its product with a pixel
 MOST_SIDE = 10**6  # pixels of a picture's side, or of a focal length: more is no camera's
 
 
@@ -93,7 +94,7 @@ def bounds_from_frames(bounds, *, where="bounds_from_frames"):
     bounds = np.asarray(bounds, np.float64)
     if bounds.ndim != 2 or bounds.shape[1] != 2 or not np.isfinite(bounds).all():
         raise ValueError(f"{where}: `bounds` should be finite (N, 2) nears and fars, got {bounds.shape}.")
-    bounds = bounds[(bounds[:, 0] > 0) & (bounds[:, 0] < bounds[:, 1])]
+    bounds = bounds[(bounds[:, 0] > 0) & (bounds[:, 0] < bounds[:, 1]) & (bounds[:, 1] < MOST_DEPTH)]
     if not len(bounds):
         raise ValueError(f"{where}: no frame has 0 < near < far; the depth bounds of the scene are wrong.")
     return 0.9 * float(np.percentile(bounds[:, 0], 5)), float(np.percentile(bounds[:, 1], 95)) / 0.9

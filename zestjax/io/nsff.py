@@ -24,6 +24,7 @@ import numpy as np
 from zestjax.cameras import Camera, camera_from_llff_pose, check_camera
 from zestjax.io.files import replaced_folder
 from zestjax.io.layouts import (
+    MOST_DEPTH,
     HeldOut,
     Later,
     Record,
@@ -100,7 +101,7 @@ def _about(path):
     if "near" not in about:
         return name, None
     near, far = (float(json_numbers(path, about, key, shape=())) for key in ("near", "far"))
-    if not 0 < near < far:
+    if not 0 < near < far < MOST_DEPTH:
         raise ValueError(f"{path}: expected 0 < `near` < `far`, got {near:g} and {far:g}; write it again.")
     return name, (near, far)
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from zestjax.checks import check_shapes
 from zestjax.io.files import write_bytes
-from zestjax.io.reading import FileWarning, read_regular
+from zestjax.io.reading import FileWarning, read_regular, silenced_stderr
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 MOST_PIXELS = 2**27  # of a picture: twice those of a telephone; as floats they take 1.6 GB
@@ -249,15 +249,12 @@ def side_by_side(pictures, *, labels=None, columns=None, gap=4):
 def _decode(path, flag=cv2.IMREAD_UNCHANGED):
     """Pixels as they are stored, (H, W) or (H, W, channels) of uint8 or uint16."""
     content = read_regular(path)
-    level = cv2.utils.logging.getLogLevel()
     try:
         _check_claim(content)
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # an error says all that needs to be said
-        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flag) if content else None
+        with silenced_stderr():
+            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flag) if content else None
     except (cv2.error, MemoryError, ValueError):
         pixels = None
-    finally:
-        cv2.utils.logging.setLogLevel(level)
     if pixels is None:
         raise ValueError(f"{path}: is not a picture that can be read (truncated, or another format); replace it.")
     if pixels.dtype not in (np.uint8, np.uint16):

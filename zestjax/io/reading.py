@@ -8,15 +8,12 @@ hidden         names that programs leave behind: `.name`, `._name` of macOS's ar
 import contextlib
 import io
 import json
-import lzma
 import math
 import os
 import re
 import stat
-import struct
 import warnings
 import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +23,6 @@ MOST_JSON = 2**26  # bytes: a pose of 20 numbers has 500, so that 100,000 frames
 NUMPY, ZIP = b"\x93NUMPY", b"PK"
 MARKS = {b"\xff\xfe\0\0": "utf-32", b"\0\0\xfe\xff": "utf-32", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 HIDDEN = ("__MACOSX",)
-UNREADABLE = (
-    OSError, ValueError, EOFError, KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError,
-    RecursionError, SyntaxError, RuntimeError, struct.error, zlib.error, lzma.LZMAError, zipfile.BadZipFile,
-)  # fmt: skip
 AGAIN = "copy or write it again."
 
 
@@ -210,6 +203,23 @@ def numbers_of(paths):
     return numbers if len(varying) <= 1 and len(set(numbers)) == len(numbers) else None
 
 
+@contextlib.contextmanager
+def silenced_stderr():
+    """Context: what libraries in C write to file descriptor 2 is dropped: an error is said once, by us."""
+    try:
+        saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    except OSError:  # there is none
+        yield
+        return
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(nowhere)
+
+
 def _check_regular(path, found, most):
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a fifo, a device or a socket"
@@ -229,7 +239,7 @@ def _explained(path, what):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy's remarks on headers of Python 2
             yield
-    except UNREADABLE as error:
+    except Exception as error:  # the parsers of numpy, zip and tokens raise a dozen kinds
         said = " ".join(str(error).split())[:200]
         raise ValueError(f"{path}: {what} ({said or type(error).__name__}); {AGAIN}") from error
 
