@@ -162,6 +162,26 @@ def test_maps_of_another_shape_than_the_frames_are_refused(tmp_path, kind):
         load(folder)
 
 
+@pytest.mark.parametrize("part", ["mv_images/00000/cam02.png", "mv_masks/00000/cam02.jpg", "truth/00000_cam02.npz"])
+def test_held_out_pictures_and_what_belongs_to_them_have_the_shape_of_the_poses(tmp_path, part):
+    def write(part, shape):
+        (folder / part).parent.mkdir(parents=True, exist_ok=True)
+        if part.endswith("npz"):
+            camera = dict(intrinsics=[[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], camera_from_world=np.eye(4))
+            np.savez(folder / part, depth=np.ones(shape), flow=np.zeros((*shape, 2)), **camera)
+        else:
+            cv2.imwrite(str(folder / part), np.eye(*shape).astype(np.uint8) * 255)
+
+    folder = nsff(tmp_path / "scene")
+    for each in ("mv_images/00000/cam02.png", "mv_masks/00000/cam02.jpg", "truth/00000_cam02.npz"):
+        write(each, (HEIGHT, WIDTH))
+    (target,) = load_scene(folder).targets
+    assert target.dynamic.any() and target.depth.shape == target.flow.shape[:2] == (HEIGHT, WIDTH)
+    write(part, (WIDTH, HEIGHT))
+    with pytest.raises(ValueError, match="cam02.*: has 48 x 64 pixels, but its poses are of 64 x 48"):
+        list(load_scene(folder).targets)
+
+
 def test_names_whose_numbers_are_not_padded_are_refused_with_both_orders(tmp_path):
     """The poses may be in either order: LLFF has them by name, a video's own are by time."""
     names = [f"img_{i + 1}.png" for i in range(N)]
@@ -378,6 +398,14 @@ DAMAGE = {
     "half the bounds": (lambda f: (f / "scene.json").write_text('{"near": 1}'), "scene.json"),
     "a name that is none": (lambda f: (f / "scene.json").write_text('{"name": 5}'), "scene.json"),
     "a fifo": (lambda f: ((f / "images/00003.png").unlink(), os.mkfifo(f / "images/00003.png")), "00003.png"),
+    "poses that never end": (
+        lambda f: ((f / "poses_bounds.npy").unlink(), (f / "poses_bounds.npy").symlink_to("/dev/zero")),
+        "poses_bounds.npy: is a fifo, a device",
+    ),
+    "poses that never come": (
+        lambda f: ((f / "poses_bounds.npy").unlink(), os.mkfifo(f / "poses_bounds.npy")),
+        "poses_bounds.npy: is a fifo, a device",
+    ),
     "endless": (lambda f: (f / "scene.json").symlink_to("/dev/zero"), "scene.json"),
 }
 

@@ -3,7 +3,8 @@
 Under the scene's folder, or `dense/` in it:
 
     poses_bounds.npy            (N, 17): 3 x 5 [down right back position | height width focal], near, far
-    images/                     N pictures, sorted by name (or images_<W>x<H>/, or images_<factor>/ as LLFF has)
+    images/                     N pictures, in the order of their names, which must be that of their numbers (or
+                                images_<W>x<H>/, or images_<factor>/ as LLFF has); resized at most, never cropped
     mv_images/00000/cam01.png   what every camera of the rig saw at a time; frame i was taken by camera i mod rig, and
                                 camera c is cam01 and so on as published: `zestjax.io.rig` reads other numberings too
     mv_masks/00000/cam01.png    their moving pixels
@@ -11,6 +12,8 @@ Under the scene's folder, or `dense/` in it:
     disp/00000.npy              (H, W) disparity, up to scale and shift (an inverse depth when simulated)
     flow_i1/00000_fwd.npz       `flow` (H, W, 2) pixels and `mask` (H, W) towards the next frame; `_bwd` the previous;
                                 or 00000_fwd.flo
+
+Masks, disparity and flow belong to the frame of their name, else of the number in it, else of their place.
 
 and, where the truth is known, `truth/00000.npz` by frame and `truth/00000_cam02.npz` by held-out picture (`depth`,
 `flow`, and its camera), with `scene.json` for the name and the exact depth bounds.

@@ -2,7 +2,7 @@
 
 regular file   no folder, fifo, device or socket: those can hang, or never end
 claim          the size that a header states; it is compared with what is there before memory is taken
-hidden         names that programs leave behind: `.name`, `._name` of macOS's archives, `__MACOSX`
+hidden         names that systems leave behind: `.name`, `._name` of macOS's archives, `__MACOSX`, bins
 """
 
 import contextlib
@@ -22,7 +22,7 @@ MOST_BYTES = 2**30  # of a file: a depth map and a flow of 8K have 400 MB
 MOST_JSON = 2**26  # bytes: a pose of 20 numbers has 500, so that 100,000 frames fit
 NUMPY, ZIP = b"\x93NUMPY", b"PK"
 MARKS = {b"\xff\xfe\0\0": "utf-32", b"\0\0\xfe\xff": "utf-32", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
-HIDDEN = ("__MACOSX",)
+HIDDEN = ("__MACOSX", "$RECYCLE.BIN", "System Volume Information", "@eaDir", "lost+found")
 AGAIN = "copy or write it again."
 
 
@@ -173,12 +173,17 @@ def json_numbers(path, found, name, *, shape=None):
 
 
 def visible(folder):
-    """What lies in a folder but hidden names, in order of number, or as text where numbers do not tell; empty where
-    there is no such folder."""
+    """What lies in a folder but hidden names, see `in_order`; empty where there is no such folder.
+
+    Raises:
+      ValueError: the folder cannot be read.
+    """
     folder = Path(folder)
-    if not folder.is_dir():
-        return ()
-    return in_order(p for p in folder.iterdir() if not p.name.startswith(".") and p.name not in HIDDEN)
+    try:
+        found = list(folder.iterdir()) if folder.is_dir() else []
+    except OSError as error:
+        raise ValueError(f"{folder}: could not be read ({error.strerror or error}); check its permissions.") from error
+    return in_order(p for p in found if not p.name.startswith(".") and p.name not in HIDDEN)
 
 
 def in_order(paths):

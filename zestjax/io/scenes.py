@@ -13,6 +13,7 @@ A protocol says what the targets are:
                figures beside the paper's
 """
 
+import os
 import re
 import warnings
 from collections.abc import Callable, Sequence
@@ -42,7 +43,7 @@ from zestjax.io.pictures import (
     resize_area,
     resize_nearest,
 )
-from zestjax.io.reading import FileWarning, check_numbers, read_array, read_arrays, visible
+from zestjax.io.reading import FileWarning, check_numbers, open_regular, read_array, read_arrays, visible
 from zestjax.video import Video
 
 PROTOCOLS = ("held-out", "strict", "paper")
@@ -184,14 +185,17 @@ def _found(path, layout):
             raise ValueError(f"{path}: holds several scenes ({names}); name one of them.")
         if found:
             return found[0]
-        folders = [inside for p in folders for inside in visible(p) if inside.is_dir()]
+        folders = [inside for p in folders for inside in visible(p) if inside.is_dir() and os.access(inside, os.X_OK)]
     raise ValueError(f"{path}: {_unsupported(path, tuple(known))}")
 
 
 def _unsupported(path, known):
     """Why a folder is in none of some layouts: which of their files are there, and what is not read of the rest."""
-    names = sorted({p.name for p in visible(path)} | {p.name for p in visible(path / "dense")})
-    marks = [name for name in names if name in MARKS]
+    inside = {p.name: p for root in (path / "dense", path) for p in visible(root)}
+    names, marks = sorted(inside), [name for name in MARKS if name in inside]
+    for name in marks:
+        with open_regular(inside[name]):  # or it is refused by what it is
+            pass
     folders = [p for root in (path, path / "dense") for p in visible(root) if re.fullmatch(r"images?(_.*)?", p.name)]
     others = sorted({p.suffix.lower() for folder in folders for p in visible(folder)} - {*SUFFIXES, ""})
     said = [f"is in none of the supported layouts ({', '.join(known)})"]
