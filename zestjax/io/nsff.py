@@ -259,7 +259,7 @@ def _camera_of(truth):
         raise ValueError(f"{truth}: holds half a camera, `{missing.pop()}` is missing; write it again.")
     shapes = dict(intrinsics=(3, 3), camera_from_world=(4, 4))
     check = lambda name: check_numbers(truth, arrays[name], shape=shapes[name], name=name, finite=True)
-    camera = Camera._make(map(check, Camera._fields))
+    camera = Camera._make(as_float32(truth, check(name)) for name in Camera._fields)
     check_camera(str(truth), camera)
     return camera
 

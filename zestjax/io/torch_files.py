@@ -12,6 +12,7 @@ import math
 import pickle
 import pickletools
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -58,7 +59,9 @@ def read_torch(path):
     path = Path(path)
     try:
         content = read_regular(path)
-        return _read_zip(content) if content[:2] == b"PK" else _read_legacy(content)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Python's remarks on text in the pickle
+            return _read_zip(content) if content[:2] == b"PK" else _read_legacy(content)
     except TorchFileError as error:
         raise TorchFileError(f"{path}: {error}") from None
     except UNREADABLE as error:
