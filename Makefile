@@ -12,7 +12,7 @@ FAST = ZESTJAX_FAST_COMPILING=1
 TEST_ENV = PJRT_NPROC=1 OMP_NUM_THREADS=1 MPLBACKEND=Agg
 PYTEST = $(TEST_ENV) $(RUN) -m pytest -q -n $(WORKERS) --dist loadfile
 
-.PHONY: test lint demo bench mutations stability precision kills notebooks test-slow test-lowest test-newest clean
+.PHONY: test lint demo bench fuzz kills mutations stability precision notebooks test-slow test-lowest test-newest clean
 
 $(VENV)/installed: pyproject.toml
 	@test -n "$(PYTHON)" || { echo "error: no Python 3.11-3.13 with venv found; pass PYTHON=/path/to/python" >&2; exit 2; }
@@ -35,6 +35,10 @@ demo: $(VENV)/installed
 
 bench: $(VENV)/installed
 	for script in experiments/benchmarks/*.py; do $(RUN) $$script || exit 1; done
+
+# 3,000 damaged files of every format: each loads, or is refused by one line that names it.
+fuzz: $(VENV)/installed
+	$(TEST_ENV) $(RUN) experiments/fuzz.py
 
 # Undo one guard of the numeric core at a time: some test must fail.
 mutations: $(VENV)/installed

@@ -158,3 +158,76 @@ def test_files_that_pytorch_wrote(name):
     assert len(read) == len(expected.files)
     for ours, theirs in zip(read.values(), (expected[key] for key in expected.files), strict=True):
         np.testing.assert_array_equal(ours.reshape(theirs.shape), theirs)
+
+
+def crafted(path, *objects):
+    """A file whose pickle, written instruction by instruction, is `objects`; storage 0 has four floats."""
+    storage = b"(X\x07\0\0\0storagectorch\nFloatStorage\nX\x01\0\0\x000X\x03\0\0\0cpuK\x04tQ"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("model/data.pkl", b"\x80\x02" + b"".join(objects).replace(b"STORAGE", storage) + b".")
+        archive.writestr("model/data/0", np.arange(4, dtype=np.float32).tobytes())
+
+
+TENSOR = b"ctorch._utils\n_rebuild_tensor_v2\n(%sK\0%s%s\x89ccollections\nOrderedDict\n)RtR"
+wide = lambda number: b"J" + number.to_bytes(4, "little")
+WIDE = TENSOR % (b"STORAGE", wide(10**5) + b"\x85", b"K\0\x85")  # one value, 100,000 times
+CRAFTED = {
+    "stride 0": (WIDE, "reaches value 0 of a storage of 4"),
+    "a tensor for a storage": (
+        TENSOR % (TENSOR % (b"STORAGE", b"K\x04\x85", b"K\1\x85"), b"K\x04\x85", b"K\1\x85"), "no window on a storage"),
+    "a list for a storage": (TENSOR % (b"]", b"K\0\x85", b"K\1\x85"), "no window"),
+    "a float for a size": (TENSOR % (b"STORAGE", b"G?\xf0\0\0\0\0\0\0\x85", b"K\1\x85"), "a tensor of shape"),
+    "a flag for a stride": (TENSOR % (b"STORAGE", b"K\1\x85", b"\x88\x85"), "a tensor of shape"),
+    "a list for a shape": (TENSOR % (b"STORAGE", b"]K\1a", b"K\1\x85"), "no window"),
+    "a note far out": (b"K\1r\xff\xff\xff\x7f", "notes value 2147483647"),
+    "a note far out, in text": (b"K\1p99999999999\n", "notes value 99999999999"),
+    "a function altered": (
+        b"ctorch._utils\n_rebuild_tensor_v2\n(N}X\x08\0\0\0functionK\1stb", "damaged"),
+    "memory claimed": (b"\x96\0\0\0\0\0\1\0\0", "m.pth"),
+    "another name's class": (b"ctorch\nFloatStorage\n)R", "damaged"),
+    "nothing crafted": (TENSOR % (b"STORAGE", b"K\1\x85", b"K\1\x85"), None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", CRAFTED)
+def test_a_crafted_file_reads_nothing_but_its_own_storages(tmp_path, kind):
+    pickled, message = CRAFTED[kind]
+    crafted(tmp_path / "m.pth", pickled)
+    if message is None:
+        assert read_torch(tmp_path / "m.pth").tolist() == [0]
+        return
+    with pytest.raises(TorchFileError, match=message):
+        read_torch(tmp_path / "m.pth")
+
+
+def test_an_archive_that_unpacks_to_more_than_it_is_is_refused(tmp_path, fake_torch):
+    flat = np.zeros(10**6, np.float32)
+    stored = {}
+    content = dumped({"x": Window(flat, (10**6,), (1,))}, fake_torch, stored)
+    with zipfile.ZipFile(tmp_path / "m.pth", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("model/data.pkl", content)
+        archive.writestr("model/data/0", flat.tobytes())
+    with pytest.raises(TorchFileError, match="compressed, which PyTorch never does"):
+        read_torch(tmp_path / "m.pth")
+
+
+@pytest.mark.parametrize("write", [write_zip, write_legacy])
+def test_a_storage_larger_than_the_file_is_refused_before_memory_is_taken(tmp_path, fake_torch, write):
+    write(tmp_path / "m.pth", {"x": Window(np.zeros(7, np.float32), (7,), (1,))}, fake_torch)
+    content = (tmp_path / "m.pth").read_bytes()
+    enlarged = lambda pickled: pickled.replace(b"K\x07", b"J\xff\xff\xff\x7f", 1)  # the storage's size stands first
+    if write is write_legacy:
+        (tmp_path / "m.pth").write_bytes(enlarged(content))
+    else:
+        pickled = zipfile.ZipFile(tmp_path / "m.pth").read("model/data.pkl")
+        with zipfile.ZipFile(tmp_path / "m.pth", "w") as archive:
+            archive.writestr("model/data.pkl", enlarged(pickled))
+            archive.writestr("model/data/0", bytes(28))
+    with pytest.raises(TorchFileError, match="claim more than the file has"):
+        read_torch(tmp_path / "m.pth")
+
+
+def test_what_is_no_regular_file_is_refused(tmp_path):
+    (tmp_path / "m.pth").mkdir()
+    with pytest.raises(TorchFileError, match="m.pth: is a folder"):
+        read_torch(tmp_path / "m.pth")

@@ -10,6 +10,7 @@ import io
 import re
 import shlex
 import sys
+import warnings
 from pathlib import Path
 
 
@@ -27,7 +28,9 @@ def main(arguments=None):
     given = sys.argv[1:] if arguments is None else arguments
     options = vars(_parser().parse_args(given))
     try:
-        return _run(options, given)
+        with warnings.catch_warnings():
+            warnings.showwarning = _said_nothing if options["quiet"] else _warned
+            return _run(options, given)
     except KeyboardInterrupt:
         return _failed("interrupted", 1)
     except OSError as error:
@@ -68,6 +71,14 @@ def _check_out(options):
             raise ValueError(f"{out}: is a folder; give the file to write.")
         out = out.parent
     check_writable(out)
+
+
+def _warned(message, *_, **__):
+    print(f"warning: {_one_line(message)}", file=sys.stderr)
+
+
+def _said_nothing(*_, **__):
+    pass
 
 
 def _failed(text, code):

@@ -7,14 +7,15 @@
 Offsets are in the base camera's axes, in units of the path's radius; the camera keeps looking at the middle depth.
 """
 
-import json
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from zestjax.apps.host import host_camera
-from zestjax.cameras import Camera, look_at, rigid_inverse
+from zestjax.cameras import Camera, check_camera, look_at, rigid_inverse
+from zestjax.io.layouts import as_float32
+from zestjax.io.reading import json_numbers, read_arrays, read_json
 
 CIRCLE = lambda s: np.stack([np.sin(2 * np.pi * s), np.cos(2 * np.pi * s), 0 * s], -1)
 PATHS = {
@@ -27,6 +28,9 @@ PATHS = {
     "frames": None,
 }
 """By name: place to offset. Time runs along the path, but stands still in `freeze`; `frames`: the input cameras."""
+
+
+SHAPES = {"intrinsics": (3, 3), "camera_from_world": (4, 4)}
 
 
 class CameraPath(NamedTuple):
@@ -104,18 +108,22 @@ def _radius(video):
 def _path_from_file(path, frames):
     if path.suffix not in (".npz", ".json") or not path.is_file():
         raise ValueError(f"{path}: is no path; give one of {', '.join(PATHS)}, or an .npz or .json file.")
-    try:
-        stored = json.loads(path.read_text()) if path.suffix == ".json" else dict(np.load(path))
-        camera = host_camera(*(np.asarray(stored[name], np.float32) for name in Camera._fields))
-        times = np.asarray(stored["times"]).astype(int)
-    except (OSError, ValueError, KeyError) as error:
+    names = (*Camera._fields, "times")
+    stored = read_json(path) if path.suffix == ".json" else read_arrays(path, names=names)
+    if missing := [name for name in names if name not in stored]:
         raise ValueError(
-            f"{path}: should hold `intrinsics`, `camera_from_world` and `times` ({error!r}); write it again."
-        ) from error
+            f"{path}: should hold `intrinsics`, `camera_from_world` and `times`, has no {missing}; write it again."
+        )
+    leaves = (json_numbers(path, stored, name, shape=(None, *shape)) for name, shape in SHAPES.items())
+    camera = host_camera(*(as_float32(path, leaf) for leaf in leaves))
+    times = json_numbers(path, stored, "times", shape=(None,))
+    if (times != np.round(times)).any():
+        raise ValueError(f"{path}: `times` should be whole numbers, got {times[times != np.round(times)][0]:g}.")
     count = len(times)
     if camera.intrinsics.shape != (count, 3, 3) or camera.camera_from_world.shape != (count, 4, 4):
         shapes = [leaf.shape for leaf in camera]
         raise ValueError(f"{path}: expected ({count}, 3, 3) and ({count}, 4, 4) for {count} times, got {shapes}.")
     if count == 0 or times.min() < 0 or times.max() >= frames:
         raise ValueError(f"{path}: `times` should lie in 0 to {frames - 1}, the frames of the video.")
-    return CameraPath(camera, times)
+    check_camera(str(path), camera)
+    return CameraPath(camera, times.astype(int))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 
 from zestjax.checks import check_option
-from zestjax.io.mvsnerf import mvsnerf_like, read_mvsnerf
+from zestjax.io.mvsnerf import STATISTICS, mvsnerf_like, read_mvsnerf
 from zestjax.io.weights import WeightsError, load_weights, read_metadata, save_weights
 from zestjax.model import init_params
 from zestjax.mvsnerf import MvsNerfConfig
@@ -25,6 +25,9 @@ SYSTEMS = {
 
 
 PUBLISHED = "mvsnerf"
+MOST_SIZE = 2**16  # of a number in a configuration: planes, channels or pixels; a larger one is damage
+MOST_LAYERS = 64  # and of what is a layer or a level each: a file may not keep us busy for hours
+COUNTED = ("field_depth", "point_levels", "view_levels", "key_frames")
 
 
 class Model(NamedTuple):
@@ -47,13 +50,33 @@ def config_from_json(fields):
     """A `Config` from its dict in a file.
 
     Raises:
-      WeightsError: fields that this version does not know.
+      WeightsError: no dict, fields that this version does not know or that are missing, other types, or sizes that no
+        model has.
     """
-    known = {field.name for field in dataclasses.fields(Config)}
-    if unknown := sorted(fields.keys() - known):
-        raise WeightsError(f"the configuration has fields that this version does not know: {', '.join(unknown)}")
+    if not isinstance(fields, dict):
+        raise WeightsError(f"the configuration is a {type(fields).__name__}, expected an object")
+    known = {field.name: field.type for field in dataclasses.fields(Config)}
+    if unknown := sorted(fields.keys() - known.keys()):
+        raise WeightsError(f"the configuration has fields that this version does not know: {', '.join(unknown)[:200]}")
     values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
-    return Config(**values)
+    if wrong := [name for name, value in values.items() if not _of_type(value, known[name])]:
+        raise WeightsError(f"the configuration has `{wrong[0]}` {str(values[wrong[0]])[:80]}, which cannot be")
+    if too_many := [name for name in COUNTED if values.get(name, 0) > MOST_LAYERS]:
+        raise WeightsError(f"the configuration has `{too_many[0]}` {values[too_many[0]]}, more than {MOST_LAYERS}")
+    try:
+        return Config(**values)
+    except (TypeError, ValueError) as error:
+        raise WeightsError(f"the configuration cannot be: {error}") from error
+
+
+def _of_type(value, kind):
+    """Whether a value of JSON is of a field's type, and its numbers of a size that a model can have."""
+    if kind is int:
+        return type(value) is int and 0 <= value <= MOST_SIZE
+    if kind is tuple:
+        sizes = isinstance(value, tuple) and 0 < len(value) <= MOST_LAYERS
+        return sizes and all(type(size) is int and abs(size) <= MOST_SIZE for size in value)
+    return type(value) is kind
 
 
 def system_of(config):
@@ -92,16 +115,20 @@ def open_weights(path=None, *, system=None, published=False):
     if metadata.get("system") == PUBLISHED:
         if not published or system not in (None, PUBLISHED):
             raise WeightsError(f"{path}: holds MVSNeRF's weights, which only `render` and `evaluate` can use.")
+        if metadata.get("statistics") not in STATISTICS:
+            raise WeightsError(
+                f"{path}: does not say whose statistics its norms have; import the published file again."
+            )
         params, _ = load_weights(path, like=mvsnerf_like(statistics=metadata["statistics"]))
         return Model(params, MvsNerfConfig(), PUBLISHED, path, metadata)
     try:
         config = config_from_json(metadata["config"])
-    except (KeyError, TypeError, WeightsError) as error:
+        like = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
+    except (KeyError, TypeError, ValueError, IndexError, ArithmeticError) as error:
         raise WeightsError(f"{path}: has no configuration this version can use ({error}); use its version.") from error
     found = system_of(config)
     if system is not None and system != found:
         raise WeightsError(f"{path}: holds weights of `{found}`, not `{system}`; train them with --system {system}.")
-    like = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
     params, _ = load_weights(path, like=like)
     return Model(params, config, found, path, metadata)
 

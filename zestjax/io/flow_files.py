@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from zestjax.io.files import write_bytes
+from zestjax.io.reading import read_regular
 
 TAG = b"PIEH"  # 202021.25 as float32
 UNKNOWN = 1e9  # a component beyond it marks a pixel whose flow is not known
@@ -17,10 +18,7 @@ def read_flo(path):
       ValueError: not such a file, or one whose length is not what its size asks for.
     """
     path = Path(path)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{path}: could not be read ({error.strerror or error}); check the path.") from error
+    content = read_regular(path)
     size = np.frombuffer(content[4:12], "<i4") if content[:4] == TAG and len(content) >= 12 else ()
     if len(size) != 2 or min(size) < 1 or len(content) != 12 + 8 * int(size[0]) * int(size[1]):
         raise ValueError(f"{path}: is not a whole .flo file ({len(content)} bytes); copy or write it again.")

@@ -15,6 +15,10 @@ import numpy as np
 
 from zestjax.cameras import Camera
 from zestjax.io.pictures import SUFFIXES
+from zestjax.io.reading import in_order, numbers_of, visible
+
+MOST_DEPTH = 1e30  # of a bound: float32 holds its product with a pixel
+MOST_SIDE = 10**6  # pixels of a picture's side, or of a focal length: more is no camera's
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,7 @@ class Record:
     reserved: tuple[int, ...] = ()
 
 
-def bounds_from_frames(bounds):
+def bounds_from_frames(bounds, *, where="bounds_from_frames"):
     """Depth bounds of a scene from those of its frames: (N, 2) -> (near, far).
 
     near is 0.9 times the 5th percentile of the nears, far the 95th percentile of the fars divided by 0.9: structure
@@ -80,15 +84,19 @@ def bounds_from_frames(bounds):
 
     Source: ZeST-NeRF's scale, 0.9 times the 5th percentile of the nears.
 
+    Args:
+      bounds: of each frame.
+      where: the file that they are of, for the message.
+
     Raises:
       ValueError: not (N, 2), not finite, or no frame with 0 < near < far.
     """
     bounds = np.asarray(bounds, np.float64)
     if bounds.ndim != 2 or bounds.shape[1] != 2 or not np.isfinite(bounds).all():
-        raise ValueError(f"bounds_from_frames: `bounds` should be finite (N, 2) nears and fars, got {bounds.shape}.")
-    bounds = bounds[(bounds[:, 0] > 0) & (bounds[:, 0] < bounds[:, 1])]
+        raise ValueError(f"{where}: `bounds` should be finite (N, 2) nears and fars, got {bounds.shape}.")
+    bounds = bounds[(bounds[:, 0] > 0) & (bounds[:, 0] < bounds[:, 1]) & (bounds[:, 1] < MOST_DEPTH)]
     if not len(bounds):
-        raise ValueError("bounds_from_frames: no frame has 0 < near < far; the depth bounds of the scene are wrong.")
+        raise ValueError(f"{where}: no frame has 0 < near < far; the depth bounds of the scene are wrong.")
     return 0.9 * float(np.percentile(bounds[:, 0], 5)), float(np.percentile(bounds[:, 1], 95)) / 0.9
 
 
@@ -98,10 +106,92 @@ def every_eighth(count):
 
 
 def pictures_in(folder):
-    """Picture files of a folder (not of folders in it), sorted by name; empty when there is no such folder."""
-    if not folder.is_dir():
-        return ()
-    return tuple(sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")))
+    """Picture files of a folder (not of folders in it), by number or name; empty when there is no such folder."""
+    return files_in(folder, SUFFIXES)
+
+
+def files_in(folder, suffixes):
+    """The files of a folder with one of some suffixes, hidden ones left out, as `zestjax.io.reading.in_order`."""
+    return in_order(p for p in visible(folder) if p.suffix.lower() in suffixes)
+
+
+def check_order(images, source):
+    """Refuse pictures whose order by name is not that of their numbers: it is not known which one the poses have.
+
+    Raises:
+      ValueError: naming both orders; `source` is the file of the poses.
+    """
+    by_name = sorted(images, key=lambda path: path.name)
+    if list(images) != by_name:
+        place = next(i for i, pair in enumerate(zip(images, by_name, strict=True)) if pair[0] != pair[1])
+        shown = lambda files: ", ".join(p.name for p in files[max(place - 1, 0) : place + 2])
+        raise ValueError(
+            f"{images[0].parent}: by number its pictures are {shown(images)}, by name {shown(by_name)}, and "
+            f"{source.name} may have either order; rename them with as many zeros as make both the same."
+        )
+
+
+def one_each(folder, files, images):
+    """{frame: file} with a file for every frame: that of its name, else of its number, else of its place.
+
+    Raises:
+      ValueError: there are some, but not as many as frames.
+    """
+    if files and len(files) != len(images):
+        raise ValueError(
+            f"{folder}: has {len(files)} files for {len(images)} frames; complete it, or remove the folder."
+        )
+    for key in (lambda paths: [path.stem for path in paths], lambda paths: numbers_of(paths) or ()):
+        theirs, ours = dict(zip(key(files), files, strict=False)), key(images)
+        if len(theirs) == len(images) and set(theirs) == set(ours):
+            return {i: theirs[k] for i, k in enumerate(ours)}
+    return dict(enumerate(files))
+
+
+def check_sizes(source, sizes):
+    """(height, width) and focal lengths of poses' columns (N, 3), once they are those of one video.
+
+    Raises:
+      ValueError: several sizes, or any of them not above 0; `source` is the file of the poses.
+    """
+    if not np.allclose(sizes[:, :2], sizes[0, :2]):
+        raise ValueError(f"{source}: frames of several sizes are not one video; resize them to one.")
+    if not (sizes > 0).all() or sizes.max() > MOST_SIDE:
+        raise ValueError(
+            f"{source}: the poses' height, width and focal length should lie between 0 and {MOST_SIDE:,}, "
+            f"got {sizes.min(0).tolist()} to {sizes.max(0).tolist()}; export it again."
+        )
+    return (max(round(sizes[0, 0]), 1), max(round(sizes[0, 1]), 1)), sizes[:, 2]
+
+
+def as_float32(source, poses):
+    """Poses as float32.
+
+    Raises:
+      ValueError: a number that float32 does not hold; `source` is their file.
+    """
+    with np.errstate(over="ignore"):
+        poses = np.asarray(poses).astype(np.float32)
+    if not np.isfinite(poses).all():
+        raise ValueError(f"{source}: holds numbers that are too large for a pose; export it again.")
+    return poses
+
+
+def frames_by_number(images, numbers, *, fits):
+    """Which frames some numbers in names mean: {number: frame}, or None if neither reading fits.
+
+    They are the numbers in the frames' names where all of them are there, else places from 0.
+
+    Args:
+      images: files of the frames.
+      numbers: those to read.
+      fits: function of {number: frame} that refuses an impossible reading.
+    """
+    named = {number: i for i, number in enumerate(numbers_of(images) or ())}
+    for reading in (named, {i: i for i in range(len(images))}):
+        if set(numbers) <= reading.keys() and fits(reading):
+            return reading
+    return None
 
 
 def select(cameras, index):

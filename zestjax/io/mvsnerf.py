@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zestjax.checks import check_option
 from zestjax.fields.trunk import ColourHead, Trunk
@@ -62,11 +63,13 @@ def mvsnerf_like(*, statistics="batch"):
 def _published(path):
     """Arrays by published name."""
     saved = read_named_arrays(path)
-    if Path(path).suffix == ".npz":
-        return saved
-    if not set(PARTS.values()) <= set(saved):
-        raise WeightsError(f"{path}: holds no {' and '.join(PARTS.values())}; {REMEDY}")
-    return {f"{part}/{name}": array for part, key in PARTS.items() for name, array in saved[key].items()}
+    if Path(path).suffix != ".npz":
+        if not all(isinstance(saved.get(key), dict) for key in PARTS.values()):
+            raise WeightsError(f"{path}: holds no {' and '.join(PARTS.values())}; {REMEDY}")
+        saved = {f"{part}/{name}": array for part, key in PARTS.items() for name, array in dict(saved[key]).items()}
+    if wrong := [name for name, x in saved.items() if not isinstance(x, np.ndarray) or x.dtype.kind not in "biuf"]:
+        raise WeightsError(f"{path}: `{str(wrong[0])[:80]}` is no array of numbers; {REMEDY}")
+    return saved
 
 
 def mvsnerf_params(arrays, *, statistics="batch"):

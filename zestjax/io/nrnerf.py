@@ -4,13 +4,13 @@ Poses are in OpenGL's axes with (height, width, focal) as a fifth column; one ca
 picture of any instant.
 """
 
-import json
 import re
 
 import numpy as np
 
 from zestjax.cameras import Camera, camera_from_opengl_pose
-from zestjax.io.layouts import Record, bounds_from_frames, pictures_in
+from zestjax.io.layouts import Record, as_float32, bounds_from_frames, check_sizes, pictures_in
+from zestjax.io.reading import json_numbers, read_json
 
 
 def is_nrnerf(path):
@@ -29,41 +29,32 @@ def read_nrnerf(path):
       ValueError: the file is not what it should be, or fewer than two pictures have a pose.
     """
     source = path / "precomputed.json"
-    try:
-        content = json.loads(source.read_text())
-        poses, bounds = (np.asarray(content[key], np.float64) for key in ("poses", "bds"))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    content = read_json(source)
+    if missing := [key for key in ("poses", "bds") if key not in content]:
         raise ValueError(
-            f"{source}: should hold `poses` (N, 3, 5) and `bds` (N, 2); {error!r}. Export it again."
-        ) from error
-    if poses.ndim != 3 or poses.shape[1:] != (3, 5) or bounds.shape != (len(poses), 2):
-        raise ValueError(
-            f"{source}: `poses` should be (N, 3, 5) and `bds` (N, 2), got {poses.shape} and {bounds.shape}."
+            f"{source}: should hold `poses` (N, 3, 5) and `bds` (N, 2), has no {missing}. Export it again."
         )
+    poses = json_numbers(source, content, "poses", shape=(None, 3, 5))
+    bounds = json_numbers(source, content, "bds", shape=(len(poses), 2))
     images = _matched(path / "images", len(poses))
     if len(images) < 2:
         raise ValueError(
             f"{path / 'images'}: {len(images)} pictures have a pose, a video needs two; check their names."
         )
     kept = sorted(images)
-    height, width, _ = sizes = poses[kept][0, :, 4]
-    if not np.allclose(poses[:, :2, 4], sizes[:2]):
-        raise ValueError(f"{source}: frames of several sizes are not one video; resize them to one.")
-    cameras = camera_from_opengl_pose(poses[kept][..., :4].astype(np.float32), height, width, _focal(poses[kept]))
-    near, far = bounds_from_frames(bounds[kept])
+    (height, width), focal = check_sizes(source, poses[kept][..., 4])
+    opengl = as_float32(source, poses[kept][..., :4])
+    cameras = camera_from_opengl_pose(opengl, poses[kept][0, 0, 4], poses[kept][0, 1, 4], focal.astype(np.float32))
+    near, far = bounds_from_frames(bounds[kept], where=str(source))
     return Record(
         name=path.resolve().name,
         layout="nrnerf",
         images=tuple(images[index] for index in kept),
         cameras=Camera._make(map(np.asarray, cameras)),
-        size=(round(height), round(width)),
+        size=(height, width),
         near=near,
         far=far,
     )
-
-
-def _focal(poses):
-    return poses[:, 2, 4].astype(np.float32)
 
 
 def _matched(folder, count):
@@ -72,6 +63,8 @@ def _matched(folder, count):
     for file in pictures_in(folder):
         digits = re.findall(r"\d+", file.stem)
         if digits:
-            numbered[int(digits[-1])] = file
+            first = numbered.setdefault(int(digits[-1]), file)
+            if first != file:
+                raise ValueError(f"{file}: has the number of {first.name}, {digits[-1]}; remove or rename one.")
     first = min(numbered, default=0) if len(numbered) == count else min(1, min(numbered, default=0))
     return {number - first: file for number, file in numbered.items() if number - first < count}

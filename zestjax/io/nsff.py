@@ -3,7 +3,8 @@
 Under the scene's folder, or `dense/` in it:
 
     poses_bounds.npy            (N, 17): 3 x 5 [down right back position | height width focal], near, far
-    images/                     N pictures, sorted by name (or images_<W>x<H>/, or images_<factor>/ as LLFF has)
+    images/                     N pictures, in the order of their names, which must be that of their numbers (or
+                                images_<W>x<H>/, or images_<factor>/ as LLFF has); resized at most, never cropped
     mv_images/00000/cam01.png   what every camera of the rig saw at a time; frame i was taken by camera i mod rig, and
                                 camera c is cam01 and so on as published: `zestjax.io.rig` reads other numberings too
     mv_masks/00000/cam01.png    their moving pixels
@@ -11,6 +12,8 @@ Under the scene's folder, or `dense/` in it:
     disp/00000.npy              (H, W) disparity, up to scale and shift (an inverse depth when simulated)
     flow_i1/00000_fwd.npz       `flow` (H, W, 2) pixels and `mask` (H, W) towards the next frame; `_bwd` the previous;
                                 or 00000_fwd.flo
+
+Masks, disparity and flow belong to the frame of their name, else of the number in it, else of their place.
 
 and, where the truth is known, `truth/00000.npz` by frame and `truth/00000_cam02.npz` by held-out picture (`depth`,
 `flow`, and its camera), with `scene.json` for the name and the exact depth bounds.
@@ -21,10 +24,25 @@ import re
 
 import numpy as np
 
-from zestjax.cameras import Camera, camera_from_llff_pose
+from zestjax.cameras import Camera, camera_from_llff_pose, check_camera
 from zestjax.io.files import replaced_folder
-from zestjax.io.layouts import HeldOut, Later, Record, bounds_from_frames, pictures_in, select
-from zestjax.io.pictures import write_image
+from zestjax.io.layouts import (
+    MOST_DEPTH,
+    HeldOut,
+    Later,
+    Record,
+    as_float32,
+    bounds_from_frames,
+    check_order,
+    check_sizes,
+    files_in,
+    frames_by_number,
+    one_each,
+    pictures_in,
+    select,
+)
+from zestjax.io.pictures import SUFFIXES, write_image
+from zestjax.io.reading import check_numbers, json_numbers, numbers_of, read_array, read_arrays, read_json, visible
 from zestjax.io.rig import find_rig, numbered, targets_of
 
 MARKER = "poses_bounds.npy"
@@ -44,38 +62,51 @@ def read_nsff(path):
     """
     root = _root(path)
     source, images = root / MARKER, _frames(root)
-    try:
-        rows = np.load(source, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise ValueError(f"{source}: is not a numpy file ({error}); copy or write it again.") from error
+    rows = read_array(source)
     if rows.ndim != 2 or rows.shape[1] != 17 or not np.isfinite(rows).all():
         raise ValueError(f"{source}: should hold finite (N, 17) poses and bounds, got {rows.shape}; write it again.")
     if not images or len(rows) != len(images):
         raise ValueError(
             f"{source}: has {len(rows)} poses for {len(images)} pictures; complete it, or remove the extra ones."
         )
-    poses = rows[:, :15].reshape(-1, 3, 5)
-    if not np.allclose(poses[:, :2, 4], poses[0, :2, 4]):
-        raise ValueError(f"{source}: frames of several sizes are not one video; resize them to one.")
-    cameras = Camera._make(map(np.asarray, camera_from_llff_pose(poses.astype(np.float32))))
-    about = json.loads((root / "scene.json").read_text()) if (root / "scene.json").is_file() else {}
-    near, far = (about["near"], about["far"]) if "near" in about else bounds_from_frames(rows[:, 15:])
+    check_order(images, source)
+    poses = rows[:, :15].astype(np.float64).reshape(-1, 3, 5)
+    size, _ = check_sizes(source, poses[..., 4])
+    cameras = Camera._make(map(np.asarray, camera_from_llff_pose(as_float32(source, poses))))
     scene = path.resolve().parent if path.resolve().name == "dense" else path.resolve()
+    name, bounds = _about(root / "scene.json")
+    near, far = bounds or bounds_from_frames(rows[:, 15:], where=str(source))
+    listed = lambda folder, suffixes: one_each(root / folder, files_in(root / folder, suffixes), images)
+    forward, backward = _flows(root / "flow_i1", images)
     return Record(
-        name=about.get("name", scene.name),
+        name=name or scene.name,
         layout="nsff",
         images=images,
         cameras=cameras,
-        size=(round(poses[0, 0, 4]), round(poses[0, 1, 4])),
+        size=size,
         near=near,
         far=far,
-        motion_masks=dict(enumerate(_one_each(root / "motion_masks", pictures_in, images))),
-        disparity=dict(enumerate(_one_each(root / "disp", lambda folder: tuple(sorted(folder.glob("*.npy"))), images))),
-        flow_forward=_flows(root, "fwd"),
-        flow_backward=_flows(root, "bwd"),
-        truth={i: p for i in range(len(rows)) if (p := root / f"truth/{i:05d}.npz").is_file()},
+        motion_masks=listed("motion_masks", SUFFIXES),
+        disparity=listed("disp", (".npy",)),
+        flow_forward=forward,
+        flow_backward=backward,
+        truth=_truths(root / "truth", images),
         held_out=Later(lambda: _held_out(root, images, cameras)),
     )
+
+
+def _about(path):
+    """(name or None, (near, far) or None) that `scene.json` tells, if there is one."""
+    about = read_json(path) if path.exists() else {}
+    name = about.get("name")
+    if name is not None and not isinstance(name, str):
+        raise ValueError(f"{path}: `name` is a {type(name).__name__}, expected text; write it again.")
+    if "near" not in about:
+        return name, None
+    near, far = (float(json_numbers(path, about, key, shape=())) for key in ("near", "far"))
+    if not 0 < near < far < MOST_DEPTH:
+        raise ValueError(f"{path}: expected 0 < `near` < `far`, got {near:g} and {far:g}; write it again.")
+    return name, (near, far)
 
 
 def write_nsff(
@@ -159,29 +190,38 @@ def _root(path):
 
 def _frames(root):
     """The frames' files: of `images/`, or of the largest of the folders of smaller ones."""
-    sized = [(-int(m[1]), p) for p in root.glob("images_*x*") if (m := re.fullmatch(r"images_(\d+)x\d+", p.name))]
-    shrunk = [(int(m[1]), p) for p in root.glob("images_*") if (m := re.fullmatch(r"images_(\d+)", p.name))]
+    sized = [(-int(m[1]), p) for p in visible(root) if (m := re.fullmatch(r"images_(\d+)x\d+", p.name))]
+    shrunk = [(int(m[1]), p) for p in visible(root) if (m := re.fullmatch(r"images_(\d+)", p.name))]
     folders = [root / "images", *(folder for _, folder in sorted(sized) + sorted(shrunk))]
     return next((files for folder in folders if (files := pictures_in(folder))), ())
 
 
-def _one_each(folder, listing, images):
-    """One file for every frame, in order; none at all when the folder is absent.
+def _flows(folder, images):
+    """({frame: file} towards the next, {frame: file} towards the previous one).
 
     Raises:
-      ValueError: there are some, but not as many as frames.
+      ValueError: the files' numbers are neither those in the frames' names nor places from 0.
     """
-    files = listing(folder) if folder.is_dir() else ()
-    if files and len(files) != len(images):
+    found = [(m, p) for p in visible(folder) if (m := re.fullmatch(r"(\d+)_(fwd|bwd)\.(npz|flo)", p.name))]
+    forward, backward = ({int(m[1]): p for m, p in found if m[2] == way} for way in ("fwd", "bwd"))
+
+    def fits(frames):  # the last frame has no next one, the first no previous one
+        return len(images) - 1 not in map(frames.get, forward) and 0 not in map(frames.get, backward)
+
+    frames = frames_by_number(images, {*forward, *backward}, fits=fits)
+    if frames is None:
         raise ValueError(
-            f"{folder}: has {len(files)} files for {len(images)} frames; complete it, or remove the folder."
+            f"{folder}: {found[0][1].name} to {found[-1][1].name} are not flows between {images[0].name} and "
+            f"{images[-1].name}; give them the frames' numbers, or remove those of other frames."
         )
-    return files
+    return tuple({frames[number]: path for number, path in files.items()} for files in (forward, backward))
 
 
-def _flows(root, direction):
-    matches = ((re.fullmatch(rf"(\d+)_{direction}\.(npz|flo)", p.name), p) for p in (root / "flow_i1").glob("*"))
-    return {int(match[1]): path for match, path in matches if match}
+def _truths(folder, images):
+    """{frame: file} of the frames' own truth files."""
+    files = {int(m[1]): p for p in visible(folder) if (m := re.fullmatch(r"(\d+)\.npz", p.name))}
+    frames = frames_by_number(images, files, fits=lambda frames: True) or {}
+    return {frames[number]: path for number, path in files.items() if number in frames}
 
 
 def _held_out(root, images, cameras):
@@ -189,9 +229,12 @@ def _held_out(root, images, cameras):
 
     A picture's camera is that of its truth file; without one, that of a frame which the same camera took.
     """
-    by_time = {int(p.name): pictures_in(p) for p in sorted((root / "mv_images").glob("*")) if p.name.isdigit()}
-    files = [(time, file) for time, files in sorted(by_time.items()) if time < len(images) for file in files]
-    truths = {entry: truth for entry in files if (truth := _truth_of(root, *entry)).is_file()}
+    folders = {int(p.name): p for p in visible(root / "mv_images") if re.fullmatch(r"[0-9]{1,9}", p.name)}
+    named = {number: i for i, number in enumerate(numbers_of(images) or ())}
+    times = named if folders.keys() <= named.keys() else {i: i for i in range(len(images))}
+    by_time = {times[number]: pictures_in(p) for number, p in folders.items() if number in times}
+    files = [(time, file) for time, files in sorted(by_time.items()) for file in files]
+    truths = {entry: truth for entry in files if (truth := _truth_of(root, entry[1])).is_file()}
     known = {entry: camera for entry, truth in truths.items() if (camera := _camera_of(truth)) is not None}
     if len(known) < len(files):
         pictures = numbered(by_time)
@@ -200,18 +243,25 @@ def _held_out(root, images, cameras):
         known = {entry: select(cameras, place) for entry, place in told.items()} | known
     for time, file in files:
         if (time, file) in known:
-            mask = root / f"mv_masks/{time:05d}/{file.stem}.png"
-            mask, truth = mask if mask.is_file() else None, truths.get((time, file))
-            yield HeldOut(time, file.stem, known[time, file], file, mask, truth)
+            masks = {mask.stem: mask for mask in pictures_in(root / "mv_masks" / file.parent.name)}
+            yield HeldOut(time, file.stem, known[time, file], file, masks.get(file.stem), truths.get((time, file)))
 
 
-def _truth_of(root, time, file):
-    return root / f"truth/{time:05d}_{file.stem}.npz"
+def _truth_of(root, file):
+    return root / f"truth/{file.parent.name}_{file.stem}.npz"
 
 
 def _camera_of(truth):
-    with np.load(truth, allow_pickle=False) as arrays:
-        return Camera(arrays["intrinsics"], arrays["camera_from_world"]) if "intrinsics" in arrays else None
+    arrays = read_arrays(truth, names=Camera._fields)
+    if not arrays:
+        return None
+    if missing := set(Camera._fields) - arrays.keys():
+        raise ValueError(f"{truth}: holds half a camera, `{missing.pop()}` is missing; write it again.")
+    shapes = dict(intrinsics=(3, 3), camera_from_world=(4, 4))
+    check = lambda name: check_numbers(truth, arrays[name], shape=shapes[name], name=name, finite=True)
+    camera = Camera._make(as_float32(truth, check(name)) for name in Camera._fields)
+    check_camera(str(truth), camera)
+    return camera
 
 
 def _write_target(root, target):

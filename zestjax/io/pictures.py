@@ -5,6 +5,8 @@ T        frames of a video
 """
 
 import math
+import struct
+import warnings
 from pathlib import Path
 
 import cv2
@@ -13,35 +15,117 @@ import numpy as np
 
 from zestjax.checks import check_shapes
 from zestjax.io.files import write_bytes
+from zestjax.io.reading import FileWarning, read_regular, silenced_stderr
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
+MOST_PIXELS = 2**27  # of a picture: twice those of a telephone; as floats they take 1.6 GB
+MOST_OFF = 0.01  # share by which rounding may change a shape: 504 x 376 for 504 x 378
+MOST_GREY = 0.01  # of a mask's pixels before it is doubted: edges of a JPEG stay below
+JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # kinds of the segment that has a JPEG's size
 
 
-def read_image(path):
-    """An image file as (H, W, 3) float32 RGB in [0, 1]; grey becomes RGB, an alpha channel is dropped.
+def read_image(path, *, native=None):
+    """An image file as (H, W, 3) float32 RGB in [0, 1], its pixels as they are stored; grey becomes RGB.
+
+    A tag that asks viewers to turn the picture (EXIF) is not followed: poses are of the pixels as stored. What lies
+    under transparent pixels is not the scene, and what should stand there is not known: such a picture is refused.
+
+    Args:
+      path: the file.
+      native: (height, width) that its cameras count pixels in; see `check_fits`.
 
     Raises:
-      ValueError: the file is missing, or not an image that OpenCV reads.
+      ValueError: the file is missing, no image that OpenCV reads, of floats, partly transparent, or does not fit.
     """
-    return np.ascontiguousarray(_decode(path, cv2.IMREAD_COLOR)[..., ::-1]).astype(np.float32) / 255
+    path = Path(path)
+    pixels = _decode(path)
+    check_fits(path, pixels.shape[:2], native)
+    colours, alpha = _colours(pixels)
+    unused = path.suffix.lower() == ".bmp" and alpha is not None and not alpha.any()
+    if alpha is not None and not unused and (share := float((alpha < _full(pixels)).mean())):
+        raise ValueError(
+            f"{path}: {share:.1%} of it are transparent; lay it on a background, or save it without alpha."
+        )
+    shades = colours[..., ::-1] if colours.shape[2] == 3 else np.repeat(colours, 3, -1)
+    return np.ascontiguousarray(shades).astype(np.float32) / _full(pixels)
 
 
-def read_mask(path):
-    """A grey image file as (H, W) bool: true where it is not black.
+def read_mask(path, *, native=None):
+    """The mask of `doubted_mask`, with a `FileWarning` where it is doubtful; raises as that."""
+    mask, doubt = doubted_mask(path, native=native)
+    if doubt:
+        warnings.warn(mask_warning({path: doubt}), FileWarning, stacklevel=2)
+    return mask
+
+
+def mask_warning(doubts):
+    """One sentence on the masks that are doubtful: {path: what `doubted_mask` says}, not empty."""
+    path, doubt = next(iter(doubts.items()))
+    others = f" (and {len(doubts) - 1} more masks like it)" if len(doubts) > 1 else ""
+    return f"{path}: {doubt}{others}; a mask is white where pixels move, black elsewhere: look at it."
+
+
+def doubted_mask(path, *, native=None):
+    """An image file as (H, W) bool: true where it is brighter than half, or is not 0 where its values are 0 and 1.
+
+    Of colours the brightest counts, and transparent pixels are black; of one colour all over, opacity is the mask.
+
+    Args:
+      path: the file.
+      native: (height, width) of the pictures that it belongs to; see `check_fits`.
+
+    Returns:
+      (mask, what makes it doubtful: str or None).
 
     Raises:
-      ValueError: the file is missing, or not an image that OpenCV reads.
+      ValueError: the file is missing, no image that OpenCV reads, of floats, or does not fit.
     """
-    return _decode(path, cv2.IMREAD_GRAYSCALE) > 0
+    path = Path(path)
+    pixels = _decode(path)
+    check_fits(path, pixels.shape[:2], native)
+    colours, alpha = _colours(pixels)
+    values = colours.max(-1)
+    if alpha is not None:
+        one_colour = (colours == colours[:1, :1]).all() and (alpha != alpha[0, 0]).any()
+        values = alpha if one_colour else np.where(2 * alpha.astype(int) > alpha.max(), values, 0)
+    share = values.astype(np.float32) / (1 if values.max() == 1 else _full(pixels))
+    return share > 0.5, _doubt(share)
 
 
 def image_size(path):
-    """(height, width) of an image file.
+    """(height, width) of an image file, as it is stored.
 
     Raises:
       ValueError: the file is missing, or not an image that OpenCV reads.
     """
-    return _decode(path, cv2.IMREAD_GRAYSCALE).shape
+    return _decode(path).shape[:2]
+
+
+def check_fits(path, have, native):
+    """Refuse a picture, or a map of its pixels, that was cropped or turned, so that no camera of its poses took it.
+
+    One that was resized passes, with the rounding that this takes: up to a pixel, or two if they are below 1 %.
+
+    Args:
+      path: its file.
+      have: its (height, width).
+      native: (height, width) that its cameras count pixels in, or None where they are not known.
+
+    Raises:
+      ValueError: naming both sizes, and the tag that turns the picture where it has one.
+    """
+    if native is None or tuple(have) == tuple(native):
+        return
+    (height, width), (rows, columns) = map(int, have), map(int, native)
+    off, side = abs(width * rows - height * columns), max(rows, columns)
+    resized = off <= side or (off <= 2 * side and off <= MOST_OFF * height * columns)
+    if not resized or height == rows or width == columns:
+        turned = path.suffix.lower() in SUFFIXES and _as_viewers_show(path).shape[:2] != (height, width)
+        hint = " (turned by EXIF? viewers show it turned, by a tag in it)" if turned else ""
+        raise ValueError(
+            f"{path}: has {width} x {height} pixels, but its poses are of {columns} x {rows}{hint}; "
+            "give the picture that the poses are of, resized at most."
+        )
 
 
 def write_image(path, picture):
@@ -162,17 +246,60 @@ def side_by_side(pictures, *, labels=None, columns=None, gap=4):
     return sheet
 
 
-def _decode(path, flag):
+def _decode(path, flag=cv2.IMREAD_UNCHANGED):
+    """Pixels as they are stored, (H, W) or (H, W, channels) of uint8 or uint16."""
+    content = read_regular(path)
     try:
-        content = np.frombuffer(Path(path).read_bytes(), np.uint8)
-        pixels = cv2.imdecode(content, flag) if content.size else None
-    except OSError as error:
-        raise ValueError(f"{path}: could not be read ({error.strerror or error}); check the path.") from error
-    except cv2.error:
+        _check_claim(content)
+        with silenced_stderr():
+            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flag) if content else None
+    except (cv2.error, MemoryError, ValueError):
         pixels = None
     if pixels is None:
         raise ValueError(f"{path}: is not a picture that can be read (truncated, or another format); replace it.")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path}: has pixels of type {pixels.dtype}, expected 8 or 16 bits; save it as a PNG.")
     return pixels
+
+
+def _as_viewers_show(path):
+    return _decode(path, cv2.IMREAD_COLOR)
+
+
+def _colours(pixels):
+    """(colours (H, W, 1 or 3), opacity (H, W) or None) of decoded pixels."""
+    pixels = pixels if pixels.ndim == 3 else pixels[..., None]
+    if pixels.shape[2] in (1, 3):
+        return pixels, None
+    return pixels[..., :-1], pixels[..., -1]
+
+
+def _full(pixels):
+    return 255 if pixels.dtype == np.uint8 else 65535
+
+
+def _check_claim(content):
+    """Refuse a PNG or JPEG whose header claims more pixels than are ever decoded."""
+    size = struct.unpack(">II", content[16:24]) if content[1:4] == b"PNG" and len(content) > 24 else (0, 0)
+    at = 2 if content[:2] == b"\xff\xd8" else len(content)
+    while at + 9 <= len(content):
+        kind, length = content[at + 1], int.from_bytes(content[at + 2 : at + 4])
+        if kind in JPEG_SIZES:
+            size = struct.unpack(">HH", content[at + 5 : at + 9])
+            break
+        at += 2 + length
+    if size[0] * size[1] > MOST_PIXELS:
+        raise ValueError(f"it claims {size[0]} x {size[1]} pixels")
+
+
+def _doubt(share):
+    """What makes the values of a mask, in [0, 1], doubtful; None where nothing does."""
+    moving, between = float((share > 0.5).mean()), float(((share > 0.25) & (share < 0.75)).mean())
+    if moving == 1:
+        return "all of it moves"
+    if moving == 0 and share.max() > 0:
+        return "nothing in it is brighter than half, so that nothing moves"
+    return f"{between:.1%} of it are grey, neither moving nor still" if between > MOST_GREY else None
 
 
 def _coloured(name, level):

@@ -13,7 +13,9 @@ A protocol says what the targets are:
                figures beside the paper's
 """
 
-import zipfile
+import os
+import re
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +32,18 @@ from zestjax.io.layouts import select
 from zestjax.io.llff import is_llff, read_llff
 from zestjax.io.nrnerf import is_nrnerf, read_nrnerf
 from zestjax.io.nsff import is_nsff, read_nsff
-from zestjax.io.pictures import image_size, read_image, read_mask, resize_area, resize_nearest
+from zestjax.io.pictures import (
+    SUFFIXES,
+    check_fits,
+    doubted_mask,
+    image_size,
+    mask_warning,
+    read_image,
+    read_mask,
+    resize_area,
+    resize_nearest,
+)
+from zestjax.io.reading import FileWarning, check_numbers, open_regular, read_array, read_arrays, visible
 from zestjax.video import Video
 
 PROTOCOLS = ("held-out", "strict", "paper")
@@ -39,6 +52,9 @@ LAYOUTS = dict(
     idr=(is_idr, read_idr), llff=(is_llff, read_llff), nsff=(is_nsff, read_nsff), nrnerf=(is_nrnerf, read_nrnerf)
 )
 """By name: a function of the folder that recognises it, and one that reads it to a `zestjax.io.layouts.Record`."""
+
+MARKS = ("poses_bounds.npy", "cameras_sphere.npz", "cameras.npz", "precomputed.json")  # the layouts' files of cameras
+FOREIGN = {"transforms.json": "nerfstudio's", "transforms_train.json": "Blender's", "sparse": "COLMAP's"}
 
 
 class Flow(NamedTuple):
@@ -135,20 +151,20 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
     size = _size(image_size(record.images[shown[0] if shown else 0]), height, width)
     images = np.zeros((len(record.images), *size, 3), np.float32)
     for i in shown:
-        images[i] = resize_area(read_image(record.images[i]), *size)
+        images[i] = resize_area(read_image(record.images[i], native=record.size), *size)
     cameras = _resized(record.cameras, record.size, size)
     video = Video._make((images, cameras, np.float32(record.near), np.float32(record.far)))
     check_inputs(str(path), video)
-    masks = _stack(record.motion_masks, len(images), lambda file: resize_nearest(read_mask(file), *size))
+    masks = _masks(record, size)
     listed = _listed(record, video, masks, protocol)
     return Scene(
         name=record.name,
         video=video,
         targets=Targets(_chosen(path, listed, targets)),
         motion_masks=masks,
-        flow_forward=_flow(record.flow_forward, len(images), size),
-        flow_backward=_flow(record.flow_backward, len(images), size),
-        disparity=_stack(record.disparity, len(images), lambda file: resize_nearest(_load(file), *size)),
+        flow_forward=_flow(record, record.flow_forward, size),
+        flow_backward=_flow(record, record.flow_backward, size),
+        disparity=_stack(record.disparity, len(images), lambda file: resize_nearest(_disparity(record, file), *size)),
         layout=record.layout,
     )
 
@@ -156,21 +172,41 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
 def _found(path, layout):
     """The folder of the scene, which may lie inside the one given, and its layout."""
     if not path.is_dir():
-        raise ValueError(f"{path}: is not a folder; give one in a supported layout ({', '.join(LAYOUTS)}).")
+        what = "is a file; give the folder of a scene" if path.is_file() else "is not a folder; give one"
+        raise ValueError(f"{path}: {what} in a supported layout ({', '.join(LAYOUTS)}).")
     if layout is not None:
         check_option("load_scene", layout=(layout, tuple(LAYOUTS)))
     known = {layout: LAYOUTS[layout]} if layout is not None else LAYOUTS
-    for pattern in (".", "*", "*/*"):
-        folders = sorted(p for p in path.glob(pattern) if p.is_dir()) if pattern != "." else [path]
+    folders = [path]
+    for _ in range(3):
         found = [(p, name) for p in folders for name, (recognises, _) in known.items() if recognises(p)]
         if len({p for p, _ in found}) > 1:
             names = ", ".join(sorted({str(p.relative_to(path)) for p, _ in found})[:5])
             raise ValueError(f"{path}: holds several scenes ({names}); name one of them.")
         if found:
             return found[0]
-    if layout is not None:
-        return path, layout
-    raise ValueError(f"{path}: is in none of the supported layouts ({', '.join(LAYOUTS)}); see `zestjax.io` on each.")
+        folders = [inside for p in folders for inside in visible(p) if inside.is_dir() and os.access(inside, os.X_OK)]
+    raise ValueError(f"{path}: {_unsupported(path, tuple(known))}")
+
+
+def _unsupported(path, known):
+    """Why a folder is in none of some layouts: which of their files are there, and what is not read of the rest."""
+    inside = {p.name: p for root in (path / "dense", path) for p in visible(root)}
+    names, marks = sorted(inside), [name for name in MARKS if name in inside]
+    for name in marks:
+        with open_regular(inside[name]):  # or it is refused by what it is
+            pass
+    folders = [p for root in (path, path / "dense") for p in visible(root) if re.fullmatch(r"images?(_.*)?", p.name)]
+    others = sorted({p.suffix.lower() for folder in folders for p in visible(folder)} - {*SUFFIXES, ""})
+    said = [f"is in none of the supported layouts ({', '.join(known)})"]
+    if marks:
+        said.append(f"it has {' and '.join(marks)}, but no pictures to it in images/ or image/")
+    else:
+        said.append(f"it has none of {', '.join(MARKS)}")
+    if others:
+        said.append(f"files of {', '.join(others[:5])} are not read, pictures of {', '.join(SUFFIXES)} are")
+    said += [f"{name} is {whose}, which is not read" for name, whose in FOREIGN.items() if name in names]
+    return "; ".join(said) + "; see `zestjax.io` on each."
 
 
 def _size(have, height, width):
@@ -210,7 +246,7 @@ def _own_views(record, video, masks, times, excluded):
             image=video.images[time],
             dynamic=None if masks is None else masks[time],
             exclude=excluded(time),
-            **_truth(record.truth.get(time), video.images.shape[1:3]),
+            **_truth(record, record.truth.get(time), video.images.shape[1:3]),
         )
 
     return [((time, "input"), lambda time=time: read(time)) for time in times]
@@ -224,9 +260,9 @@ def _other_views(record, size):
             time=entry.time,
             camera_name=entry.camera_name,
             camera=_resized(entry.camera, record.size, size),
-            image=resize_area(read_image(entry.image), *size),
-            dynamic=None if entry.mask is None else resize_nearest(read_mask(entry.mask), *size),
-            **_truth(entry.truth, size),
+            image=resize_area(read_image(entry.image, native=record.size), *size),
+            dynamic=None if entry.mask is None else resize_nearest(read_mask(entry.mask, native=record.size), *size),
+            **_truth(record, entry.truth, size),
         )
 
     return [((entry.time, entry.camera_name), lambda entry=entry: read(entry)) for entry in record.held_out]
@@ -247,32 +283,72 @@ def _chosen(path, listed, targets):
     return chosen
 
 
-def _truth(path, size):
+def _truth(record, path, size) -> dict:
     """`depth` and `flow` of a truth file at a size, those that it has."""
     if path is None:
         return {}
-    arrays = _arrays(path)
-    known = {key: resize_nearest(arrays[key], *size) for key in ("depth", "flow") if key in arrays}
+    arrays = read_arrays(path, names=("depth", "flow"))
+    known = {key: resize_nearest(_map(record, path, array, key), *size) for key, array in arrays.items()}
     if "flow" in known:
         known["flow"] = known["flow"] * _flow_scale(arrays["flow"].shape, size)
     return known
 
 
-def _flow(files, count, size):
+def _masks(record, size):
+    """(N, H, W) moving pixels of the frames, or None unless all have a mask; warns of those that are doubtful."""
+    doubts = {}
+
+    def read(file):
+        mask, doubt = doubted_mask(file, native=record.size)
+        doubts.update({file: doubt} if doubt else {})
+        return resize_nearest(mask, *size)
+
+    masks = _stack(record.motion_masks, len(record.images), read)
+    if doubts:
+        warnings.warn(mask_warning(doubts), FileWarning, stacklevel=3)  # of the line that loads the scene
+    return masks
+
+
+def _flow(record, files, size):
     """`Flow` of the frames, not valid where a frame has no file; None when none has."""
     if not files:
         return None
+    count = len(record.images)
     vectors, valid = np.zeros((count, *size, 2), np.float32), np.zeros((count, *size), bool)
-    for i in range(count):
-        if i in files:
-            arrays = _arrays(files[i])
-            if not {"flow", "mask"} <= arrays.keys():
-                raise ValueError(f"{files[i]}: should hold `flow` and `mask`, got {sorted(arrays)}; compute it again.")
-            valid[i] = resize_nearest(arrays["mask"], *size) > 0
-            flow = resize_nearest(arrays["flow"], *size) * _flow_scale(arrays["flow"].shape, size)
-            valid[i] &= np.isfinite(flow).all(-1)
-            vectors[i] = np.where(valid[i][..., None], flow, 0)
+    for i, file in files.items():
+        stored, mask = _stored_flow(record, file)
+        valid[i] = resize_nearest(mask, *size) > 0
+        flow = resize_nearest(stored, *size) * _flow_scale(stored.shape, size)
+        valid[i] &= np.isfinite(flow).all(-1)
+        vectors[i] = np.where(valid[i][..., None], flow, 0)
     return Flow(vectors, valid)
+
+
+def _stored_flow(record, path):
+    """(flow (H, W, 2), mask (H, W)) of a file."""
+    if path.suffix == ".flo":
+        flow, mask = read_flo(path)
+    else:
+        arrays = read_arrays(path)
+        if not {"flow", "mask"} <= arrays.keys():
+            raise ValueError(f"{path}: should hold `flow` and `mask`, got {sorted(arrays)[:5]}; compute it again.")
+        flow, mask = arrays["flow"], arrays["mask"]
+    flow = _map(record, path, flow, "flow")
+    return flow, check_numbers(path, mask, shape=flow.shape[:2], name="mask")
+
+
+def _disparity(record, path):
+    return _map(record, path, read_array(path), "disparity")
+
+
+def _map(record, path, array, name):
+    """Numbers by pixel (H, W), of a flow (H, W, 2), as floats, if they are of the shape of the record's pictures."""
+    array = check_numbers(path, array, shape=(None, None, 2) if name == "flow" else (None, None), name=name)
+    if min(array.shape) < 1:
+        raise ValueError(f"{path}: `{name}` is empty, {array.shape}; write it again.")
+    check_fits(path, array.shape[:2], record.size)
+    with np.errstate(over="ignore"):
+        return array if array.dtype.kind == "f" and array.dtype.itemsize <= 4 else array.astype(np.float32)
 
 
 def _flow_scale(have, size):
@@ -282,16 +358,3 @@ def _flow_scale(have, size):
 def _stack(files, count, read):
     """One array for all frames; None unless every frame has a file."""
     return np.stack([read(files[i]) for i in range(count)]) if all(i in files for i in range(count)) else None
-
-
-def _arrays(path) -> dict:
-    """The arrays of an npz file, by name, or of a .flo file."""
-    return dict(zip(("flow", "mask"), read_flo(path), strict=True)) if path.suffix == ".flo" else _load(path, dict)
-
-
-def _load(path, of=np.asarray):
-    """What a numpy file holds, read by `of`; a missing or damaged file is a ValueError."""
-    try:
-        return of(np.load(path, allow_pickle=False))
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: is not a numpy file that can be read ({error}); copy or write it again.") from error

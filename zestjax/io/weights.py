@@ -6,7 +6,6 @@ and a SHA-256 over names, types, shapes, values and that metadata.
 
 import hashlib
 import json
-import struct
 from pathlib import Path
 
 import jax
@@ -16,6 +15,10 @@ import safetensors
 import safetensors.numpy
 
 from zestjax.io.files import write_bytes
+from zestjax.io.reading import open_regular, parse_json
+
+MOST_BYTES = 2**30  # of a file: a checkpoint of the largest preset has some 2 % of it
+MOST_HEADER = 100_000_000  # bytes: the limit of safetensors itself
 
 _DTYPES = {
     **{f"F{bits}": np.dtype(f"float{bits}") for bits in (16, 32, 64)},
@@ -144,28 +147,62 @@ def _digest(arrays, text):
 
 
 def _read(path):
-    """The stored arrays by name and the metadata, verified."""
+    """The stored arrays by name and the metadata, verified. The header is looked at before the rest is read."""
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise WeightsError(f"{path}: could not be read ({error.strerror or error}); check the path.") from error
+        with open_regular(path, most=MOST_BYTES) as (file, size):
+            content = _head(path, file, size)
+            header = _header(path, content)
+            content += file.read(size - len(content))
+    except DamagedFileError:
+        raise
+    except ValueError as error:
+        raise WeightsError(str(error)) from error
     try:
-        (length,) = struct.unpack("<Q", content[:8])
-        header = json.loads(content[8 : 8 + length]).get("__metadata__", {})
         stored = dict(safetensors.deserialize(content))
         arrays = {
             name: np.frombuffer(entry["data"], _DTYPES[entry["dtype"]]).reshape(entry["shape"])
             for name, entry in stored.items()
         }
-    except (struct.error, ValueError, KeyError, AttributeError, safetensors.SafetensorError) as error:
-        raise DamagedFileError(
-            f"{path}: is truncated or not a safetensors file ({len(content)} bytes); copy or write it again."
-        ) from error
-    text = header.get("metadata")
-    if header.get("format") != "zestjax" or text is None:
-        raise DamagedFileError(f"{path}: is a safetensors file that zestjax did not write; give weights that it wrote.")
+    except (ValueError, KeyError, TypeError, OverflowError, MemoryError, safetensors.SafetensorError) as error:
+        raise _damaged(path, size) from error
+    text = header["metadata"]
     if header.get("sha256") != _digest(arrays, text):
         raise DamagedFileError(
             f"{path}: was altered after it was written (its checksum differs); copy or write it again."
         )
-    return arrays, json.loads(text)
+    return arrays, _metadata(path, text)
+
+
+def _head(path, file, size):
+    """The file's first bytes, up to the end of its header, if their number can be right."""
+    start = file.read(8)
+    length = int.from_bytes(start, "little")
+    if len(start) != 8 or length > min(size - 8, MOST_HEADER):
+        raise _damaged(path, size)
+    return start + file.read(length)
+
+
+def _header(path, content):
+    """The header's own metadata: a dict of strings, if zestjax wrote it."""
+    try:
+        header = parse_json(content[8:])
+    except ValueError as error:
+        raise _damaged(path, len(content)) from error
+    found = header.get("__metadata__") if isinstance(header, dict) else None
+    if not isinstance(found, dict) or found.get("format") != "zestjax" or not isinstance(found.get("metadata"), str):
+        raise DamagedFileError(f"{path}: is a safetensors file that zestjax did not write; give weights that it wrote.")
+    return found
+
+
+def _metadata(path, text):
+    try:
+        metadata = parse_json(text.encode())
+    except ValueError as error:
+        raise WeightsError(f"{path}: its metadata is not JSON ({error}); give weights that zestjax wrote.") from error
+    if not isinstance(metadata, dict):
+        raise WeightsError(f"{path}: its metadata is a {type(metadata).__name__}, expected an object; write it again.")
+    return metadata
+
+
+def _damaged(path, size):
+    return DamagedFileError(f"{path}: is truncated or not a safetensors file ({size:,} bytes); copy or write it again.")
