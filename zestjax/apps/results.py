@@ -8,6 +8,7 @@ import json
 import re
 
 from zestjax.io.files import write_bytes
+from zestjax.io.reading import read_json
 
 OURS = re.compile(r"((frames|pictures)/[^/]+\.png|video\.(webm|webp))")
 
@@ -37,7 +38,7 @@ def write_record(record, told):
 def _read(record):
     """An earlier record; empty where there is none that can be read."""
     try:
-        told = json.loads(record.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        told = read_json(record)
+    except (OSError, ValueError):
         return {}
     return told if isinstance(told, dict) else {}
