@@ -145,7 +145,7 @@ def test_doctor_says_what_is_wrong_and_fails(capsys, monkeypatch, tmp_path):
     wrong = Check("mapped sum", False, "relative error 1")
     monkeypatch.setattr(doctor, "backend_checks", lambda *, seed: (wrong,))
     (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr(doctor, "cache_folder", lambda: tmp_path / "file" / "zestjax")
     assert main(["doctor"]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[-1].startswith("doctor: 2 faults: mapped sum: relative error 1; cache folder:")

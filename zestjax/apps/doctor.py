@@ -131,7 +131,8 @@ def flags() -> list[Finding]:
         "unknown": "this jaxlib is newer than those tried, nothing was changed",
     }[state]
     kept = [name for name in ("JAX_PLATFORMS", "JAX_ENABLE_X64") if os.environ.get(name)]
-    return [Finding(True, "XLA_FLAGS", f"{found or '(empty)'}: {said}"),
+    ours = True if state in ("off", "unknown") else None
+    return [Finding(ours, "XLA_FLAGS", f"{found or '(empty)'}: {said}"),
             *(Finding(None, name, os.environ[name]) for name in kept)]  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from zestjax.io.weights import DamagedFileError, WeightsError, load_weights, save_weights
+from zestjax.io.weights import DamagedFileError, UnreadableFileError, WeightsError, load_weights, save_weights
 
 _NAME = re.compile(r"step_(\d{9,})\.safetensors")
 
@@ -76,9 +76,7 @@ def latest_checkpoint(folder, like):
     for step, path in _found(folder):
         try:
             tree, metadata = load_weights(path, like=like)
-        except WeightsError as error:
-            if not (isinstance(error, DamagedFileError) or isinstance(error.__cause__, OSError)):
-                raise
+        except (DamagedFileError, UnreadableFileError) as error:
             warnings.append(str(error))
             continue
         return Checkpoint(step, tree, metadata, path, tuple(warnings))

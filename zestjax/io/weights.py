@@ -37,6 +37,10 @@ class DamagedFileError(WeightsError):
     """The file is truncated, was altered after it was written, or is no weights file."""
 
 
+class UnreadableFileError(WeightsError):
+    """There is a file of that name, and it cannot be read: the disk's fault, no permission, or no regular file."""
+
+
 def save_weights(path, params, *, metadata):
     """Write a tree of arrays and its metadata to one file, atomically.
 
@@ -156,7 +160,7 @@ def _read(path):
     except DamagedFileError:
         raise
     except ValueError as error:
-        raise WeightsError(str(error)) from error
+        raise UnreadableFileError(str(error)) from error
     try:
         stored = dict(safetensors.deserialize(content))
         arrays = {
