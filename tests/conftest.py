@@ -3,9 +3,12 @@
 `ZESTJAX_FAST_COMPILING` asks for code that compiles fast instead of running fast, as most of it runs once.
 """
 
+import ctypes
+import gc
 import importlib.metadata
 import os
 import shutil
+import sys
 import tempfile
 
 import pytest
@@ -47,6 +50,11 @@ def nothing_compiled_is_kept():
     """A worker would hold some GB of programs that no later module runs."""
     yield
     jax.clear_caches()
+    gc.collect()
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc's: what is free goes back to the system
+        if trim is not None:
+            trim(0)
 
 
 @pytest.fixture
