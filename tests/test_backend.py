@@ -55,7 +55,8 @@ def test_what_must_not_be_touched_is_not(monkeypatch, flags, state, change):
 
 def test_where_jax_runs_already_a_wrong_sum_is_warned_of(monkeypatch):
     with pytest.warns(backend.CompilerWarning, match="returns wrong sums here.*set XLA_FLAGS=.*before Python starts"):
-        decided(monkeypatch, "", runs=True, error=0.9)
+        found = decided(monkeypatch, "", runs=True, error=0.9)
+    assert found == (("running", ""), "")
 
 
 LATE = """

@@ -296,7 +296,7 @@ def test_every_expected_error_is_one_line(error, code, words, monkeypatch, capsy
     def fail(options):
         raise error
 
-    monkeypatch.setattr("zestjax.cli._run_doctor", fail)
+    monkeypatch.setattr("zestjax.apps.commands._run_doctor", fail)
     assert main(["doctor"]) == code
     said = capsys.readouterr().err
     assert words in said and said.startswith("error: ") and said.count("\n") == 1

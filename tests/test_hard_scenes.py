@@ -85,7 +85,6 @@ def test_a_half_precision_step_learns_in_the_same_direction_with_whole_gradients
     assert same_direction(compiled("mini")(*args)[0], compiled("mini", "bfloat16")(*args)[0])
 
 
-@pytest.mark.slow
 def test_a_half_precision_step_of_the_papers_system_does_too():
     # At random weights points come next to the camera's plane, where the geometric loss tells any two roundings apart.
     weights, args = PAPER_WEIGHTS._replace(geo=None), hard("paper", SCENES[0])

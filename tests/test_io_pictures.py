@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from zestjax.io import pictures, video
+from zestjax.io import figures, pictures, video
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_what_is_no_picture_is_refused(tmp_path, picture):
 
 def test_depth_pictures_are_even_in_inverse_depth_and_black_where_there_is_none():
     depth = np.array([[1.0, 2.0, np.inf, -1.0, np.nan, 0.5]])
-    shown = pictures.depth_picture(depth, near=1.0, far=np.float32(4.0))
+    shown = figures.depth_picture(depth, near=1.0, far=np.float32(4.0))
     assert shown.shape == (1, 6, 3) and shown.dtype == np.float32
     np.testing.assert_array_equal(shown[0, 2:5], 0)
     np.testing.assert_array_equal(shown[0, 5], shown[0, 0])
@@ -62,7 +62,7 @@ def test_depth_pictures_are_even_in_inverse_depth_and_black_where_there_is_none(
 def test_error_pictures_grow_brighter_with_the_error():
     truth = np.zeros((1, 3, 3))
     guess = np.array([0.0, 0.1, 0.2])[None, :, None] * np.ones(3)
-    brightness = pictures.error_picture(guess, truth).sum(-1)[0]
+    brightness = figures.error_picture(guess, truth).sum(-1)[0]
     assert brightness[0] == pytest.approx(0, abs=0.1) and np.all(np.diff(brightness) > 0)
 
 
@@ -80,14 +80,14 @@ def test_nearest_resizing_takes_the_pixel_at_the_centre():
 
 
 def test_sheets_hold_every_picture_in_its_place(picture):
-    sheet = pictures.side_by_side([picture, picture // 2, picture], labels=["a", "b", "c"], columns=2)
+    sheet = figures.side_by_side([picture, picture // 2, picture], labels=["a", "b", "c"], columns=2)
     assert sheet.shape == (4 + 2 * (7 + 18 + 4), 4 + 2 * (9 + 4), 3)
     np.testing.assert_array_equal(sheet[22:29, 17:26], picture // 2)
     np.testing.assert_array_equal(sheet[51:58, 4:13], picture)
     with pytest.raises(ValueError, match="one size"):
-        pictures.side_by_side([picture, picture[1:]])
+        figures.side_by_side([picture, picture[1:]])
     with pytest.raises(ValueError, match="`labels` has 1 entries, expected 2"):
-        pictures.side_by_side([picture, picture], labels=["a"])
+        figures.side_by_side([picture, picture], labels=["a"])
 
 
 def moving_bar(height, width, count):

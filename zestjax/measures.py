@@ -47,7 +47,6 @@ def unmeasured(config):
     """
     others = [name for name in Terms._fields if name not in RAY_TERMS + SCENE_TERMS]
     found = dict.fromkeys(others, "a measure of your own, bound by `losses.objective.make_objective`")
-    volumes = config.geometry or (config.motion and config.dynamic)
     if not config.dynamic:
         found |= dict.fromkeys(set(RAY_TERMS) - {"rec", "static_rec"}, "a dynamic field, `dynamic=True`")
     else:
@@ -56,9 +55,9 @@ def unmeasured(config):
             found |= dict.fromkeys(NEIGHBOUR_TERMS, "slots next to the target time, -1 or 1")
         elif len(there) == 1:
             found["temp"] = "slots on both sides of the target time, -1 and 1"
-    if not volumes or config.sampling != "guided":
+    if not config.any_volume or config.sampling != "guided":
         found["depth_ce"] = "volumes that guide the sampling: `geometry` or `motion`, with `sampling='guided'`"
-    if not volumes or config.encoder != "frames":
+    if not config.analysed:
         found |= dict.fromkeys(FRAME_TERMS, "the frames' own analysis: `encoder='frames'`, with `geometry` or `motion`")
     return found
 

@@ -103,11 +103,10 @@ def init_params(key, config):
         )  # fmt: skip
 
     slots = len(config.slots)
-    motion = config.motion and config.dynamic
-    analysed = frames and (config.geometry or motion)
+    motion = config.motion_volume
     sizes = dict(planes=config.evidence_planes, features=config.features, widths=config.frame_widths)
     return ZestParams(
-        init_analysis(keys[0], **sizes) if analysed else None,
+        init_analysis(keys[0], **sizes) if config.analysed else None,
         volume(keys[1], config.key_frames, False) if config.geometry else None,
         volume(keys[2], slots, True) if motion else None,
         field(keys[3], init_static, config.geometry, config.key_frames, 3),
@@ -202,7 +201,7 @@ def volumes(params, inputs, maps, *, config):
         )  # fmt: skip
 
     geometry = volume(params.geometry, inputs.key, of_key, False) if config.geometry else None
-    motion = volume(params.motion, inputs.slots, of_slots, True) if config.motion and config.dynamic else None
+    motion = volume(params.motion, inputs.slots, of_slots, True) if config.motion_volume else None
     return geometry, motion
 
 

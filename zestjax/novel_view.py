@@ -93,9 +93,9 @@ def prepare(params, video, *, config, exclude=()):
 
 def _check_params(where, params, config):
     """Refuse parameters without a part that the configuration computes."""
-    motion = config.motion and config.dynamic
-    analysed = config.encoder == "frames" and (config.geometry or motion)
-    parts = dict(analysis=analysed, geometry=config.geometry, motion=motion, dynamic=config.dynamic)
+    parts = dict(
+        analysis=config.analysed, geometry=config.geometry, motion=config.motion_volume, dynamic=config.dynamic
+    )
     if lacking := [name for name, needed in parts.items() if needed and getattr(params, name) is None]:
         raise ValueError(
             f"{where}: `params` have no `{lacking[0]}`, which `config` asks for; give the configuration of the weights."

@@ -80,6 +80,21 @@ class Config:
         )
         self._check_together()
 
+    @property
+    def motion_volume(self):
+        """Whether there is a motion volume: without a dynamic field nothing would read it."""
+        return self.motion and self.dynamic
+
+    @property
+    def any_volume(self):
+        """Whether there is a volume at all."""
+        return self.geometry or self.motion_volume
+
+    @property
+    def analysed(self):
+        """Whether the frames are asked for their own depth and moving pixels."""
+        return self.encoder == "frames" and self.any_volume
+
     def _check_together(self):
         """Choices that only work together; raises `ValueError`."""
         frames = self.encoder == "frames"

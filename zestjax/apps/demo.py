@@ -17,8 +17,9 @@ from zestjax.apps.scenes import BENCH_SIZE, open_scene
 from zestjax.apps.scoring import number, score_depth
 from zestjax.apps.stereo import stereo_scene
 from zestjax.apps.weights import arithmetic, open_weights
+from zestjax.io.figures import depth_picture, error_picture, share_picture, side_by_side
 from zestjax.io.files import write_bytes
-from zestjax.io.pictures import depth_picture, error_picture, share_picture, side_by_side, write_image
+from zestjax.io.pictures import write_image
 from zestjax.io.scenes import Target
 from zestjax.io.video import write_video
 

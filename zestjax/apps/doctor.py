@@ -54,7 +54,7 @@ def doctor(options: DoctorOptions) -> Report:
         "versions": versions(),
         "devices": devices(),
         "flags": flags(),
-        "miscompilations": [Finding(*check_of(check)) for check in backend_checks(seed=options.seed)],
+        "miscompilations": [Finding(c.ok, c.name, c.detail) for c in backend_checks(seed=options.seed)],
         "resources": [memory(), cache(cache_folder())],
         "extras": extras(),
     }
@@ -70,11 +70,6 @@ def doctor(options: DoctorOptions) -> Report:
         f"doctor: {len(faults)} fault{'s' * (len(faults) > 1)}: {'; '.join(faults)}" if faults else "doctor: all well"
     )
     return Report("\n".join([*lines, last]), not faults)
-
-
-def check_of(check):
-    """(ok, name, found) of a `testing.Check`."""
-    return check.ok, check.name, check.detail
 
 
 def versions() -> list[Finding]:

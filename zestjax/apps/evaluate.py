@@ -20,8 +20,9 @@ from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, s
 from zestjax.apps.tables import headline, write_table
 from zestjax.apps.weights import PUBLISHED, arithmetic, at_precision, open_weights, standing_still
 from zestjax.inputs import check_target
+from zestjax.io.figures import depth_picture, error_picture, share_picture, side_by_side
 from zestjax.io.lpips import load_lpips
-from zestjax.io.pictures import depth_picture, error_picture, share_picture, side_by_side, write_image
+from zestjax.io.pictures import write_image
 
 LABELS = ("nearest input", "novel view", "truth", "error", "depth", "dynamicness")
 

@@ -15,35 +15,23 @@ A protocol says what the targets are:
 
 import os
 import re
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from zestjax.cameras import Camera, resized
 from zestjax.checks import check_option
 from zestjax.inputs import check_inputs
-from zestjax.io.flow_files import read_flo
 from zestjax.io.idr import is_idr, read_idr
 from zestjax.io.layouts import select
 from zestjax.io.llff import is_llff, read_llff
+from zestjax.io.maps import Flow, disparity_of, flow_of, masks_of, truth_of
 from zestjax.io.nrnerf import is_nrnerf, read_nrnerf
 from zestjax.io.nsff import is_nsff, read_nsff
-from zestjax.io.pictures import (
-    SUFFIXES,
-    check_fits,
-    doubted_mask,
-    image_size,
-    mask_warning,
-    read_image,
-    read_mask,
-    resize_area,
-    resize_nearest,
-)
-from zestjax.io.reading import FileWarning, check_numbers, open_regular, read_array, read_arrays, visible
+from zestjax.io.pictures import SUFFIXES, image_size, read_image, read_mask, resize_area, resize_nearest
+from zestjax.io.reading import open_regular, visible
 from zestjax.video import Video
 
 PROTOCOLS = ("held-out", "strict", "paper")
@@ -55,13 +43,6 @@ LAYOUTS = dict(
 
 MARKS = ("poses_bounds.npy", "cameras_sphere.npz", "cameras.npz", "precomputed.json")  # the layouts' files of cameras
 FOREIGN = {"transforms.json": "nerfstudio's", "transforms_train.json": "Blender's", "sparse": "COLMAP's"}
-
-
-class Flow(NamedTuple):
-    """Optical flow of every frame. vectors: (N, H, W, 2) pixels, 0 where not valid. valid: (N, H, W) bool."""
-
-    vectors: np.ndarray
-    valid: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -155,16 +136,16 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
     cameras = _resized(record.cameras, record.size, size)
     video = Video._make((images, cameras, np.float32(record.near), np.float32(record.far)))
     check_inputs(str(path), video)
-    masks = _masks(record, size)
+    masks = masks_of(record, size)
     listed = _listed(record, video, masks, protocol)
     return Scene(
         name=record.name,
         video=video,
         targets=Targets(_chosen(path, listed, targets)),
         motion_masks=masks,
-        flow_forward=_flow(record, record.flow_forward, size),
-        flow_backward=_flow(record, record.flow_backward, size),
-        disparity=_stack(record.disparity, len(images), lambda file: resize_nearest(_disparity(record, file), *size)),
+        flow_forward=flow_of(record, record.flow_forward, size),
+        flow_backward=flow_of(record, record.flow_backward, size),
+        disparity=disparity_of(record, size),
         layout=record.layout,
     )
 
@@ -246,7 +227,7 @@ def _own_views(record, video, masks, times, excluded):
             image=video.images[time],
             dynamic=None if masks is None else masks[time],
             exclude=excluded(time),
-            **_truth(record, record.truth.get(time), video.images.shape[1:3]),
+            **truth_of(record, record.truth.get(time), video.images.shape[1:3]),
         )
 
     return [((time, "input"), lambda time=time: read(time)) for time in times]
@@ -262,7 +243,7 @@ def _other_views(record, size):
             camera=_resized(entry.camera, record.size, size),
             image=resize_area(read_image(entry.image, native=record.size), *size),
             dynamic=None if entry.mask is None else resize_nearest(read_mask(entry.mask, native=record.size), *size),
-            **_truth(record, entry.truth, size),
+            **truth_of(record, entry.truth, size),
         )
 
     return [((entry.time, entry.camera_name), lambda entry=entry: read(entry)) for entry in record.held_out]
@@ -281,80 +262,3 @@ def _chosen(path, listed, targets):
             raise ValueError(f"{path}: no target {wanted}; this protocol has times {times[0]} to {times[-1]}.")
         chosen += readers
     return chosen
-
-
-def _truth(record, path, size) -> dict:
-    """`depth` and `flow` of a truth file at a size, those that it has."""
-    if path is None:
-        return {}
-    arrays = read_arrays(path, names=("depth", "flow"))
-    known = {key: resize_nearest(_map(record, path, array, key), *size) for key, array in arrays.items()}
-    if "flow" in known:
-        known["flow"] = known["flow"] * _flow_scale(arrays["flow"].shape, size)
-    return known
-
-
-def _masks(record, size):
-    """(N, H, W) moving pixels of the frames, or None unless all have a mask; warns of those that are doubtful."""
-    doubts = {}
-
-    def read(file):
-        mask, doubt = doubted_mask(file, native=record.size)
-        doubts.update({file: doubt} if doubt else {})
-        return resize_nearest(mask, *size)
-
-    masks = _stack(record.motion_masks, len(record.images), read)
-    if doubts:
-        warnings.warn(mask_warning(doubts), FileWarning, stacklevel=3)  # of the line that loads the scene
-    return masks
-
-
-def _flow(record, files, size):
-    """`Flow` of the frames, not valid where a frame has no file; None when none has."""
-    if not files:
-        return None
-    count = len(record.images)
-    vectors, valid = np.zeros((count, *size, 2), np.float32), np.zeros((count, *size), bool)
-    for i, file in files.items():
-        stored, mask = _stored_flow(record, file)
-        valid[i] = resize_nearest(mask, *size) > 0
-        flow = resize_nearest(stored, *size) * _flow_scale(stored.shape, size)
-        valid[i] &= np.isfinite(flow).all(-1)
-        vectors[i] = np.where(valid[i][..., None], flow, 0)
-    return Flow(vectors, valid)
-
-
-def _stored_flow(record, path):
-    """(flow (H, W, 2), mask (H, W)) of a file."""
-    if path.suffix == ".flo":
-        flow, mask = read_flo(path)
-    else:
-        arrays = read_arrays(path)
-        if not {"flow", "mask"} <= arrays.keys():
-            raise ValueError(f"{path}: should hold `flow` and `mask`, got {sorted(arrays)[:5]}; compute it again.")
-        flow, mask = arrays["flow"], arrays["mask"]
-    flow = _map(record, path, flow, "flow")
-    return flow, check_numbers(path, mask, shape=flow.shape[:2], name="mask")
-
-
-def _disparity(record, path):
-    return _map(record, path, read_array(path), "disparity")
-
-
-def _map(record, path, array, name):
-    """Numbers by pixel (H, W), of a flow (H, W, 2), as floats, if they are of the shape of the record's pictures."""
-    array = check_numbers(path, array, shape=(None, None, 2) if name == "flow" else (None, None), name=name)
-    if min(array.shape) < 1:
-        raise ValueError(f"{path}: `{name}` is empty, {array.shape}; write it again.")
-    check_fits(path, array.shape[:2], record.size)
-    with np.errstate(over="ignore"):
-        return array if array.dtype.kind == "f" and array.dtype.itemsize <= 4 else array.astype(np.float32)
-
-
-def _flow_scale(have, size):
-    return np.array([size[1] / have[1], size[0] / have[0]], np.float32)
-
-
-def _stack(files, count, read):
-    """One array for all frames; None unless every frame has a file."""
-    return np.stack([read(files[i]) for i in range(count)]) if all(i in files for i in range(count)) else None

@@ -17,6 +17,7 @@ import numpy as np
 from zestjax.checks import check_shapes
 from zestjax.io.files import write_bytes
 from zestjax.io.pictures import to_bytes
+from zestjax.io.reading import silenced_stderr
 
 
 def write_video(path_stem, frames, *, fps=24):
@@ -113,7 +114,7 @@ def _decoded(path):
 
 def _encode_webm(path, bgr, fps):
     height, width = bgr.shape[1:3]
-    with _silenced_stderr():
+    with silenced_stderr():  # FFmpeg's remarks on the codec's tag
         writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP80"), fps, (width, height))
     if not writer.isOpened():
         return False
@@ -129,16 +130,3 @@ def _encode_webp(path, bgr, fps):
     animation = cv2.Animation()
     animation.frames, animation.durations = list(bgr), [round(1000 / fps)] * len(bgr)
     return cv2.imwriteanimation(str(path), animation, [cv2.IMWRITE_WEBP_QUALITY, 90])
-
-
-@contextlib.contextmanager
-def _silenced_stderr():
-    """OpenCV's FFmpeg remarks on the codec tag, straight to file descriptor 2, whatever its log level."""
-    saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(nowhere)
