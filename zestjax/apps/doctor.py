@@ -123,7 +123,7 @@ def flags() -> list[Finding]:
         "user": "set before zestjax was imported, left as it is",
         "running": "JAX ran before zestjax was imported, nothing was changed",
         "file": "XLA_FLAGS names a file, which is left alone",
-        "unknown": "this jaxlib is newer than those tried, nothing was changed",
+        "unknown": "this jaxlib is none of those the flag was tried on, nothing was changed",
     }[state]
     kept = [name for name in ("JAX_PLATFORMS", "JAX_ENABLE_X64") if os.environ.get(name)]
     ours = True if state in ("off", "unknown") else None

@@ -19,7 +19,6 @@ from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
 from zestjax.apps.tables import headline, write_table
 from zestjax.apps.weights import PUBLISHED, arithmetic, at_precision, open_weights, standing_still
-from zestjax.inputs import check_target
 from zestjax.io.figures import depth_picture, error_picture, share_picture, side_by_side
 from zestjax.io.lpips import load_lpips
 from zestjax.io.pictures import write_image
@@ -94,7 +93,6 @@ def score_scene(view_of, opened, options, out):
     planned = [{"file": picture_name(target)} for target in scene.targets if options.pictures]
     results.begin(out / "metrics.json", picture_names, {"scene": scene.name, "unfinished": True, "targets": planned})
     for target in progress(scene.targets, scene.name, quiet=options.quiet):
-        check_target(scene.name, scene.video, target.camera)
         shown = out if options.pictures else None
         rows.append(evaluate_target(view_of, scene, target, opened.ceiling, shown, lpips))
     height, width = scene.video.images.shape[1:3]
@@ -129,7 +127,7 @@ class Renderer:
     """
 
     def __init__(self, model, video, *, steady=False, **changes):
-        self.model, self.steady = model, steady
+        self.model = model
         self.prepare_seconds = self.compile_seconds = None
         self.config = dataclasses.replace(model.config, **changes)
         self.system = mvsnerf if model.system == PUBLISHED else novel_view
