@@ -282,3 +282,28 @@ def test_a_place_is_tried_without_being_made(tmp_path):
     for out, words in (("/proc/1/x", "Permission denied|Read-only|No such"), ("/dev/null/x", "Not a directory")):
         with pytest.raises(OSError, match=words):
             check_writable(out)
+
+
+@pytest.mark.parametrize("number", [np.float32(1.5), np.float64(1.5), np.int64(3), np.bool_(True), np.float16(0.5)])
+def test_numpys_numbers_are_stored_as_numbers(tmp_path, number):
+    save_weights(tmp_path / "w", {"a": np.zeros(2)}, metadata={"rate": number, "deep": [{"x": (number, "text", None)}]})
+    found = read_metadata(tmp_path / "w")
+    assert found == {"rate": number.item(), "deep": [{"x": [number.item(), "text", None]}]}
+    assert type(found["rate"]) is type(number.item())
+
+
+@pytest.mark.parametrize(
+    "metadata, words",
+    [
+        ({"a": {"b": [1, 1j]}}, r"`metadata\['a'\]\['b'\]\[1\]` is of type complex"),
+        ({"a": np.zeros(3)}, r"`metadata\['a'\]` is of type ndarray"),
+        ({"a": np.datetime64("2020-01-01")}, r"`metadata\['a'\]` is of type date"),
+        ({"a": Path("x")}, r"`metadata\['a'\]` is of type"),
+        ({"a": {1: 2}}, r"`metadata\['a'\]` has the key 1, expected text"),
+        ([1], "`metadata` is of type list, expected a dict"),
+    ],
+)
+def test_metadata_that_json_cannot_hold_is_named(tmp_path, metadata, words):
+    with pytest.raises(WeightsError, match=f"save_weights: {words}"):
+        save_weights(tmp_path / "w", {"a": np.zeros(2)}, metadata=metadata)
+    assert not list(tmp_path.iterdir())

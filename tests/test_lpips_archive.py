@@ -19,6 +19,7 @@ from scipy.ndimage import gaussian_filter
 from test_lpips import oracle_maps, published
 
 from zestjax.cli import main
+from zestjax.io.archives import ArchiveError, read_member
 from zestjax.io.array_pickles import ArrayPickleError, read_array_pickle
 from zestjax.io.lpips import DIGEST, MEMBER, MOST_MEMBER, MOST_UNPACKED, import_lpips, load_lpips, read_lpips_archive
 from zestjax.io.weights import WeightsError
@@ -309,6 +310,16 @@ def real():
         alexnet[f"features.{n}.bias"] = tree["AlexNet_0"][f"Conv_{i}"]["bias"]
         heads[f"lin{i}.model.1.weight"] = tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].transpose(3, 2, 0, 1)
     return read_lpips_archive(path), (alexnet, heads)
+
+
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path):
+    """A fifo that nobody writes to would be waited for, for ever."""
+    os.mkfifo(tmp_path / "fifo")
+    for name, words in {"fifo": "is a fifo", ".": "is a folder", "absent": "could not be read"}.items():
+        with pytest.raises(ArchiveError, match=words):
+            read_member(tmp_path / name, "a", most=1, most_unpacked=1)
+        with pytest.raises(WeightsError, match=words):
+            read_lpips_archive(tmp_path / name)
 
 
 def photograph():

@@ -10,6 +10,8 @@ import tarfile
 import zlib
 from pathlib import Path
 
+from zestjax.io.reading import open_regular
+
 GZIP = b"\x1f\x8b"  # how every gzip file begins
 MOST_MEMBERS = 1000  # of an archive that are looked at; a larger one is not what was asked for
 UNREADABLE = (
@@ -47,11 +49,21 @@ def read_member(path, name, *, most, most_unpacked):
       bytes.
 
     Raises:
-      ArchiveError: no gzip file, a damaged one, no such member, one that is no plain file, or more bytes than allowed.
-      OSError: the file cannot be read.
+      ArchiveError: no regular file, one that cannot be read, no gzip file, a damaged one, no such member, one that is
+        no plain file, or more bytes than allowed.
     """
     try:
-        with gzip.open(path) as packed, tarfile.open(fileobj=_Limited(packed, most_unpacked), mode="r|") as archive:
+        with open_regular(path) as (file, _):
+            return _member(path, file, name, most, most_unpacked)
+    except ArchiveError:
+        raise
+    except ValueError as error:
+        raise ArchiveError(str(error).removesuffix(".")) from error
+
+
+def _member(path, file, name, most, most_unpacked):
+    try:
+        with gzip.open(file) as packed, tarfile.open(fileobj=_Limited(packed, most_unpacked), mode="r|") as archive:
             for member in itertools.islice(archive, MOST_MEMBERS):
                 if member.name == name:
                     return _content(archive, member, most)

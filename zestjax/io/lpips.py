@@ -70,8 +70,6 @@ def read_lpips_archive(path, *, digest=DIGEST):
         kernels = [arrays["AlexNet_0"][f"Conv_{i}"]["kernel"] for i in layers]
         biases = [arrays["AlexNet_0"][f"Conv_{i}"]["bias"] for i in layers]
         rows = [arrays[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1) for i in layers]
-    except OSError as error:
-        raise WeightsError(f"{path}: could not be read ({error.strerror or error}); check the path.") from error
     except ArchiveError as error:
         raise WeightsError(f"{error}; {FETCH}") from error
     except ArrayPickleError as error:

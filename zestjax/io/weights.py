@@ -19,6 +19,7 @@ from zestjax.io.reading import open_regular, parse_json
 
 MOST_BYTES = 2**30  # of a file: a checkpoint of the largest preset has some 2 % of it
 MOST_HEADER = 100_000_000  # bytes: the limit of safetensors itself
+JSON = (dict, list, tuple, str, int, float, type(None))  # what JSON holds; a bool is an int
 
 _DTYPES = {
     **{f"F{bits}": np.dtype(f"float{bits}") for bits in (16, 32, 64)},
@@ -47,18 +48,33 @@ def save_weights(path, params, *, metadata):
     Args:
       path: the file; an earlier one is replaced only once the new one is complete.
       params: pytree of arrays; PRNG keys, bfloat16 and scalars keep their types.
-      metadata: dict of what JSON can hold; the full configuration belongs here.
+      metadata: dict of what JSON can hold, or NumPy's numbers; the full configuration belongs here.
 
     Raises:
-      WeightsError: the disk is full or the place not writable; an earlier file is unchanged, no part of the new left.
+      WeightsError: metadata that JSON cannot hold; the disk is full or the place not writable; an earlier file is unchanged, no part of the new left.
     """
     arrays = {name: _to_numpy(leaf) for name, leaf in _named_leaves(params)}
-    text = json.dumps(metadata, sort_keys=True)
+    text = json.dumps(_plain(metadata), sort_keys=True)
     header = {"format": "zestjax", "metadata": text, "sha256": _digest(arrays, text)}
     try:
         write_bytes(path, safetensors.numpy.save(arrays, metadata=header))
     except OSError as error:
         raise WeightsError(f"{path}: could not be written: {error.strerror or error}.") from error
+
+
+def _plain(value, place="metadata", kinds=(dict,)):
+    """Metadata of Python's own types, NumPy's numbers with it; `place`: where in it the value stands."""
+    value = value.item() if isinstance(value, np.generic) else value
+    if not isinstance(value, kinds):
+        wanted = "a dict" if kinds == (dict,) else "text, a number, bool, None, or a list or dict of them"
+        raise WeightsError(f"save_weights: `{place}` is of type {type(value).__name__}, expected {wanted}.")
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry, f"{place}[{i}]", JSON) for i, entry in enumerate(value)]
+    if not isinstance(value, dict):
+        return value
+    if odd := [key for key in value if not isinstance(key, str)]:
+        raise WeightsError(f"save_weights: `{place}` has the key {odd[0]!r}, expected text as keys.")
+    return {key: _plain(entry, f"{place}[{key!r}]", JSON) for key, entry in value.items()}
 
 
 def load_weights(path, *, like=None):
