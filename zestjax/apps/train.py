@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 
 import zestjax
+from zestjax.apps.cache import STALE_DAYS, held_clips, remove_stale_clips
 from zestjax.apps.clips import EVIDENCE, ClipSpec, clip_folder, hole_key
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
@@ -40,7 +41,8 @@ class TrainOptions:
 
     out, preset, steps, minutes, resume, seed, quiet: as the command's.
     weights: start from these. analysis: take the part that analyses single frames from these instead.
-    clips: folder of rendered clips, kept; None: the cache, where used ones are removed. clip_count: reuse that many
+    clips: folder of rendered clips, kept; None: the cache, where used ones are removed, and when a run starts those of
+    others that ended long ago (`cache.STALE_DAYS`). clip_count: reuse that many
     clips; None: new ones for ever. window: clips alive at a time. steps_per_clip: steps between one new clip and the
     next. scenes: folders (or `bench:NAME`) whose own frames are predicted from one another; no simulated clips.
     checkpoint_minutes: between two checkpoints. system: one of `weights.SYSTEMS`. stage: one of `learn.STAGES`.
@@ -140,6 +142,13 @@ def say_left_out(config, options):
         print(f"train: this system learns without {listed}", file=sys.stderr)
 
 
+def say_removed(folders, options):
+    """Name on standard error the clips of other runs that were removed from the cache."""
+    if folders and not options.quiet:
+        listed = "; ".join(map(str, folders))
+        print(f"train: removed clips that no run has used for {STALE_DAYS} days: {listed}", file=sys.stderr)
+
+
 def run_metadata(config, options, videos=()):
     """Everything that makes one run's numbers differ from another's, as JSON can hold it; `videos`: of its scenes."""
     data: dict = {"scenes": [digest(video) for video in videos] or "simulated", "clip_count": options.clip_count}
@@ -202,13 +211,19 @@ class _SimulatedBatches:
         self.window = {"window": options.window, "steps_per_clip": options.steps_per_clip, "count": self.count}
         self.ahead = AHEAD * options.steps_per_clip
         evict = options.clips is None and self.count is None
-        self.source = ClipSource(spec, folder, alive=min(options.window, KEPT) + 1, evict=evict)
+        self.ends = contextlib.ExitStack()
+        if options.clips is None:
+            self.ends.enter_context(held_clips(folder))
+            say_removed(remove_stale_clips(folder), options)
+        self.source = self.ends.enter_context(
+            ClipSource(spec, folder, alive=min(options.window, KEPT) + 1, evict=evict)
+        )
 
     def __enter__(self):
         return self.batch
 
     def __exit__(self, *_):
-        self.source.__exit__()
+        self.ends.close()
 
     def batch(self, step):
         key = batch_key(step, seed=self.seed)

@@ -51,7 +51,8 @@ def save_weights(path, params, *, metadata):
       metadata: dict of what JSON can hold, or NumPy's numbers; the full configuration belongs here.
 
     Raises:
-      WeightsError: metadata that JSON cannot hold; the disk is full or the place not writable; an earlier file is unchanged, no part of the new left.
+      WeightsError: metadata that JSON cannot hold; or the disk is full or the place not writable: an earlier file is
+        unchanged, no part of the new left.
     """
     arrays = {name: _to_numpy(leaf) for name, leaf in _named_leaves(params)}
     text = json.dumps(_plain(metadata), sort_keys=True)
