@@ -296,5 +296,5 @@ def test_wrong_arguments_are_refused():
         cost_volume.cost_volume(tables, homographies, grid, trust=maps, depths=depths[1:])
     with pytest.raises(ValueError, match="`per_view` is 9"):
         cost_volume.cost_volume(tables, homographies, grid, per_view=9)
-    with pytest.raises(ValueError, match="multiple of 4, got 6 x 8"):
+    with pytest.raises(ValueError, match="multiple of 4, got 6x8"):
         cost_volume.quarter_colours(jnp.zeros((6, 8, 3)))

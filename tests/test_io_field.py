@@ -84,7 +84,7 @@ def test_a_frame_that_viewers_turn_is_refused_where_only_that_would_fit(tmp_path
         (folder / f"images/{i:05d}.png").unlink()
         write_tagged(folder / f"images/{i:05d}.jpg", photograph(i), 6)
     with pytest.raises(
-        ValueError, match=r"00000.jpg: has 64 x 48 pixels, but its poses are of 48 x 64 \(turned by EXIF"
+        ValueError, match=r"00000.jpg: has 48x64 pixels \(HxW\), but its poses are of 64x48 \(turned by EXIF"
     ):
         load(folder)
 
@@ -107,7 +107,7 @@ def test_a_picture_of_another_shape_than_its_poses_is_refused_in_every_layout(tm
         as_idr(folder)
     assert load(folder).layout == layout
     cv2.imwrite(str(folder / "images/00005.png"), photograph(5, size=SHAPES[shape]))
-    with pytest.raises(ValueError, match="00005.png: has .* pixels, but its poses are of 64 x 48"):
+    with pytest.raises(ValueError, match="00005.png: has .* pixels.*, but its poses are of 48x64"):
         load(folder)
 
 
@@ -158,7 +158,7 @@ def test_maps_of_another_shape_than_the_frames_are_refused(tmp_path, kind):
             write_flo(place / f"{i:05d}_fwd.flo", np.zeros((*shape, 2)))
         else:
             np.savez(place / f"{i:05d}_fwd.npz", flow=np.zeros((*shape, 2)), mask=np.ones(shape))
-    with pytest.raises(ValueError, match="00004.*: has 48 x 64 pixels, but its poses are of 64 x 48"):
+    with pytest.raises(ValueError, match="00004.*: has 64x48 pixels.*, but its poses are of 48x64"):
         load(folder)
 
 
@@ -178,7 +178,7 @@ def test_held_out_pictures_and_what_belongs_to_them_have_the_shape_of_the_poses(
     (target,) = load_scene(folder).targets
     assert target.dynamic.any() and target.depth.shape == target.flow.shape[:2] == (HEIGHT, WIDTH)
     write(part, (WIDTH, HEIGHT))
-    with pytest.raises(ValueError, match="cam02.*: has 48 x 64 pixels, but its poses are of 64 x 48"):
+    with pytest.raises(ValueError, match="cam02.*: has 64x48 pixels.*, but its poses are of 48x64"):
         list(load_scene(folder).targets)
 
 
@@ -326,7 +326,7 @@ def test_a_picture_that_claims_more_pixels_than_any_camera_has_is_refused(tmp_pa
     cv2.imwrite(str(path), photograph(0))
     content = path.read_bytes()
     path.write_bytes(content[:16] + struct.pack(">II", 30_000, 30_000) + content[24:])
-    with pytest.raises(ValueError, match="a.png: is not a picture"):
+    with pytest.raises(ValueError, match=r"a.png: claims 30000x30000 pixels \(HxW\), more than"):
         pictures.read_image(path)
 
 
@@ -375,7 +375,7 @@ def test_the_scale_of_idrs_matrices_is_known(tmp_path, case):
 def test_the_scale_of_idrs_matrices_is_never_guessed(tmp_path, options):
     folder = as_idr(nsff(tmp_path / "scene"), **options)
     with pytest.raises(
-        ValueError, match=r"cameras_sphere.npz: its cameras look at pixel \([\d., ]+\).*64 x 48.*add `size`"
+        ValueError, match=r"cameras_sphere.npz: its cameras look at pixel \([\d., ]+\).*48x64.*add `size`"
     ):
         load(folder)
 

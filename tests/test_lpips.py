@@ -133,7 +133,7 @@ def test_gradient_is_the_slope_of_finite_differences(x64, params):
 
 
 def test_faults_are_named(params, files, tmp_path):
-    with pytest.raises(ValueError, match="lpips: `image` is 30 x 40, expected at least 31 x 31"):
+    with pytest.raises(ValueError, match=r"lpips: `image` is 30x40 \(HxW\), expected at least 31x31"):
         lpips(params, IMAGE[:30, :40], IMAGE[:30, :40])
     alexnet, heads = published()
     del heads["lin3.model.1.weight"]

@@ -175,6 +175,6 @@ def quarter_colours(images):
     """
     height, width = images.shape[-3:-1]
     if height % 4 or width % 4:
-        raise ValueError(f"quarter_colours: image size should be a multiple of 4, got {height} x {width}.")
+        raise ValueError(f"quarter_colours: image size should be a multiple of 4, got {height}x{width} (HxW).")
     blocks = images.reshape(*images.shape[:-3], height // 4, 4, width // 4, 4, images.shape[-1])
     return jnp.mean(blocks[..., :, 1:3, :, 1:3, :], axis=(-4, -2))

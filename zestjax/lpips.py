@@ -90,7 +90,7 @@ def lpips(params, image, truth, *, mask=None):
     """
     sizes = check_shapes("lpips", image=(image, "H W 3"), truth=(truth, "H W 3"))
     if min(sizes["H"], sizes["W"]) < LEAST_SIDE:
-        raise ValueError(f"lpips: `image` is {sizes['H']} x {sizes['W']}, expected at least 31 x 31.")
+        raise ValueError(f"lpips: `image` is {sizes['H']}x{sizes['W']} (HxW), expected at least 31x31.")
     maps = lpips_maps(params, image, truth)
     if mask is None:
         return sum(jnp.mean(m) for m in maps)

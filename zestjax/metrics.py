@@ -86,7 +86,7 @@ def ssim_map(image, truth):
     sizes = check_shapes("ssim", image=(image, "H W C"), truth=(truth, "H W C"))
     if min(sizes["H"], sizes["W"]) < 2 * SSIM_RADIUS + 1:
         raise ValueError(
-            f"ssim: `image` is {sizes['H']} x {sizes['W']}, expected at least 11 x 11, the size of the window."
+            f"ssim: `image` is {sizes['H']}x{sizes['W']} (HxW), expected at least 11x11, the size of the window."
         )
     zero = jnp.zeros_like(image)
     moments = (image, truth, zero, zero, zero)

@@ -28,7 +28,7 @@ def write_report(out, report, film):
     stereo = report["stereo"]
     parts = [
         f"<h1>New views of a scene never seen: {html.escape(report['scene'])}</h1>",
-        f"<p>A video of {report['height']} x {report['width']} pixels, one camera at a time; every view below is of "
+        f"<p>A video of {report['height']}x{report['width']} pixels, one camera at a time; every view below is of "
         "another camera at that time, which no input contained. Nothing was trained on this scene.</p>",
         "<h2>A moving camera while time runs</h2>", _film(film), "<h2>Beside the truth</h2>",
         '<img src="side_by_side.png" alt="input, novel view, truth, error, depth, dynamicness">',

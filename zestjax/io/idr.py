@@ -125,6 +125,6 @@ def _native(source, cameras, images, size):
     down, right = middle.mean(0)
     raise ValueError(
         f"{source}: its cameras look at pixel ({right:.1f}, {down:.1f}), column and row, which is not the middle of "
-        f"{images[0].name} ({have[1]} x {have[0]}): were the pictures resized or cropped? Give those that the matrices "
-        f"are of, or add `size` (height, width), in which they count pixels, to {source.name}."
+        f"{images[0].name} ({have[0]}x{have[1]}, HxW): were the pictures resized or cropped? Give those that the "
+        f"matrices are of, or add `size` (height, width), in which they count pixels, to {source.name}."
     )

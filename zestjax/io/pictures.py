@@ -4,21 +4,21 @@ picture  (H, W, 3) RGB, float in [0, 1] or uint8
 T        frames of a video
 """
 
-import struct
 import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from zestjax.io.claims import claimed_size
 from zestjax.io.files import write_bytes
 from zestjax.io.reading import FileWarning, read_regular, silenced_stderr
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 MOST_PIXELS = 2**27  # of a picture: twice those of a telephone; as floats they take 1.6 GB
-MOST_OFF = 0.01  # share by which rounding may change a shape: 504 x 376 for 504 x 378
+MOST_OFF = 0.01  # share by which rounding may change a shape: 376x504 for 378x504
 MOST_GREY = 0.01  # of a mask's pixels before it is doubted: edges of a JPEG stay below
-JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # kinds of the segment that has a JPEG's size
+UNREADABLE = "is not a picture that can be read (truncated, or none of PNG, JPEG, BMP, WebP and TIFF); replace it."
 
 
 def read_image(path, *, native=None):
@@ -120,7 +120,7 @@ def check_fits(path, have, native):
         turned = path.suffix.lower() in SUFFIXES and _as_viewers_show(path).shape[:2] != (height, width)
         hint = " (turned by EXIF? viewers show it turned, by a tag in it)" if turned else ""
         raise ValueError(
-            f"{path}: has {width} x {height} pixels, but its poses are of {columns} x {rows}{hint}; "
+            f"{path}: has {height}x{width} pixels (HxW), but its poses are of {rows}x{columns}{hint}; "
             "give the picture that the poses are of, resized at most."
         )
 
@@ -179,14 +179,14 @@ def resize_nearest(values, height, width):
 def _decode(path, flag=cv2.IMREAD_UNCHANGED):
     """Pixels as they are stored, (H, W) or (H, W, channels) of uint8 or uint16."""
     content = read_regular(path)
+    _check_claim(path, content)
     try:
-        _check_claim(content)
         with silenced_stderr():
-            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flag) if content else None
-    except (cv2.error, MemoryError, ValueError):
+            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flag)
+    except (cv2.error, MemoryError):
         pixels = None
     if pixels is None:
-        raise ValueError(f"{path}: is not a picture that can be read (truncated, or another format); replace it.")
+        raise ValueError(f"{path}: {UNREADABLE}")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"{path}: has pixels of type {pixels.dtype}, expected 8 or 16 bits; save it as a PNG.")
     return pixels
@@ -208,18 +208,16 @@ def _full(pixels):
     return 255 if pixels.dtype == np.uint8 else 65535
 
 
-def _check_claim(content):
-    """Refuse a PNG or JPEG whose header claims more pixels than are ever decoded."""
-    size = struct.unpack(">II", content[16:24]) if content[1:4] == b"PNG" and len(content) > 24 else (0, 0)
-    at = 2 if content[:2] == b"\xff\xd8" else len(content)
-    while at + 9 <= len(content):
-        kind, length = content[at + 1], int.from_bytes(content[at + 2 : at + 4])
-        if kind in JPEG_SIZES:
-            size = struct.unpack(">HH", content[at + 5 : at + 9])
-            break
-        at += 2 + length
-    if size[0] * size[1] > MOST_PIXELS:
-        raise ValueError(f"it claims {size[0]} x {size[1]} pixels")
+def _check_claim(path, content):
+    """Refuse a picture whose header claims more pixels than are ever decoded, or whose header is of none."""
+    claim = claimed_size(content)
+    if claim is None:
+        raise ValueError(f"{path}: {UNREADABLE}")
+    if claim[0] * claim[1] > MOST_PIXELS:
+        raise ValueError(
+            f"{path}: claims {claim[0]}x{claim[1]} pixels (HxW), more than the {MOST_PIXELS:,} that are read; "
+            "give a smaller one."
+        )
 
 
 def _doubt(share):

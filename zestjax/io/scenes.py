@@ -196,7 +196,7 @@ def _size(have, height, width):
         height = have[0] if width is None else round(width * have[0] / have[1])
     width = round(height * have[1] / have[0]) if width is None else width
     if min(height, width) < 1:
-        raise ValueError(f"load_scene: the size is {height} x {width}, expected at least 1 x 1.")
+        raise ValueError(f"load_scene: the size is {height}x{width}, expected at least 1x1.")
     return int(height), int(width)
 
 
