@@ -13,7 +13,6 @@ import argparse
 import contextlib
 import re
 import sys
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ from zestjax import mvsnerf
 from zestjax.cameras import rigid_inverse
 from zestjax.checks import check_shapes
 from zestjax.io.mvsnerf import read_mvsnerf
+from zestjax.io.reading import read_arrays
 from zestjax.io.weights import WeightsError
 from zestjax.nets.feature_pyramid import imagenet_normalised
 from zestjax.rendering import alpha_from_density, weights_from_density
@@ -209,19 +209,16 @@ def said(error):
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
-def read_arrays(path):
+def read_record(path):
     """The arrays of an npz by name.
 
     Raises:
       ParityError: the file cannot be read, or is none.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except OSError as error:
-        raise ParityError(f"could not be read ({error.strerror or error}); check the path.") from error
-    except (ValueError, AttributeError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise ParityError("is no npz of plain arrays, or a damaged one; check the path.") from error
+        return read_arrays(path)
+    except ValueError as error:
+        raise ParityError(str(error)) from error
 
 
 def read_weights(path):
@@ -231,7 +228,7 @@ def read_weights(path):
       ParityError, WeightsError: the file cannot be read, or holds other weights.
     """
     if Path(path).suffix == ".npz":
-        read_arrays(path)
+        read_record(path)
     return Weights(*(read_mvsnerf(path, statistics=kind) for kind in ("batch", "stored")))
 
 
@@ -253,7 +250,7 @@ def main(arguments=None):
     options = parser.parse_args(arguments)
     path = options.golden
     try:
-        record, path = read_arrays(path), options.weights
+        record, path = read_record(path), options.weights
         weights, path = read_weights(path), options.golden
         rows = compare(record, weights)
     except (ParityError, WeightsError) as error:

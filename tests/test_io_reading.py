@@ -4,6 +4,7 @@ import io
 import os
 import re
 import socket
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -194,10 +195,21 @@ def test_the_number_of_a_name_is_the_run_of_digits_that_varies(names, numbers):
 
 
 def test_users_files_are_read_in_one_place():
-    """The rest of the package reads its own: a run's log, the clips that it has rendered."""
+    """So are a run's log, its clips, and the record that `check_parity` is given; its own folders it lists itself."""
     package = Path(zestjax.__file__).parent
     pattern = re.compile(
         r"np\.load\(|json\.loads?\(|np\.fromfile|cv2\.imread\(|\.iterdir\(\)|np\.genfromtxt|np\.loadtxt"
     )
     found = {str(p.relative_to(package)) for p in package.rglob("*.py") if pattern.search(p.read_text())}
-    assert found - {"apps/clips.py", "apps/log.py", "io/files.py", "simulate/textures.py"} == {"io/reading.py"}
+    assert found - {"io/files.py", "simulate/textures.py"} == {"io/reading.py"}
+    assert not pattern.search((package.parent / "experiments/check_parity.py").read_text())
+
+
+def test_memory_is_taken_for_what_is_there_not_for_what_may_be(tmp_path):
+    (tmp_path / "small").write_bytes(b"123")
+    tracemalloc.start()
+    assert read_regular(tmp_path / "small") == b"123"
+    assert tracemalloc.get_traced_memory()[1] < 2**22
+    tracemalloc.stop()
+    if Path("/proc/self/status").exists():  # a regular file that says it is empty
+        assert read_regular("/proc/self/status").startswith(b"Name:")

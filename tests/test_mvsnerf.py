@@ -3,6 +3,7 @@
 `experiments/check_parity.py` compares them; here it must also fail where something is wrong, and fix no size.
 """
 
+import os
 import subprocess
 import sys
 
@@ -102,13 +103,16 @@ def test_images_that_do_not_fit_fail_what_is_computed_from_them(files, capsys, c
 def test_files_of_another_kind_are_refused_in_one_line(files, tmp_path, capsys):
     folder, record = files
     (tmp_path / "text.npz").write_text("no arrays")
+    os.mkfifo(tmp_path / "fifo.npz")
     np.save(tmp_path / "one.npy", record["z_lin"])
     np.savez(tmp_path / "part.npz", imgs01=record["imgs01"])
     np.savez(tmp_path / "few.npz", **{"fn/nerf.pts_bias.weight": np.zeros((128, 20))})
     golden, weights = folder / "golden.npz", folder / "weights.npz"
     for paths, words in {
-        (tmp_path / "text.npz", weights): "text.npz: is no npz", (tmp_path / "one.npy", weights): "one.npy: is no npz",
+        (tmp_path / "text.npz", weights): "text.npz: is not a numpy file that can be read",
+        (tmp_path / "one.npy", weights): "one.npy: holds one array (.npy), expected arrays by name",
         (tmp_path / "part.npz", weights): "part.npz: holds no w2cs, intrinsics, near_far;",
+        (tmp_path / "fifo.npz", weights): "fifo.npz: is a fifo", (golden, tmp_path / "fifo.npz"): "fifo.npz: is a fifo",
         (weights, weights): "weights.npz: holds no imgs01", (golden, golden): "golden.npz: lacks or misshapes",
         (golden, tmp_path / "few.npz"): "few.npz: lacks or misshapes",
     }.items():  # fmt: skip

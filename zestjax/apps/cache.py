@@ -69,8 +69,8 @@ def held_clips(folder):
 def remove_stale_clips(folder):
     """Remove what was left in the folders of clips beside this one that no process holds; what was removed, as paths.
 
-    A folder stays for `STALE_DAYS` after a run began or ended with it or wrote to it, and for ever where the file system
-    has no locks.
+    A folder stays for `STALE_DAYS` after a run began or ended with it or wrote to it, and where the file system has no
+    locks for ever.
     """
     removed, oldest = [], time.time() - STALE_DAYS * 86400
     for other in sorted(Path(folder).parent.glob("*-seed*-*")):

@@ -14,8 +14,6 @@ import hashlib
 import io
 import os
 import sys
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,9 +21,9 @@ import numpy as np
 
 from zestjax.apps.cache import cache_folder
 from zestjax.io.files import write_bytes
+from zestjax.io.reading import read_arrays
 
 ORIGIN = "origin"
-_BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, NotImplementedError)
 EVIDENCE = "evidence_"
 """Before the names of the evidence's arrays, which share a dict with the clip's."""
 
@@ -88,12 +86,12 @@ def read_clip(path, origin):
       FileNotFoundError: there is none.
     """
     try:
-        with np.load(path) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, LookupError, TypeError, AttributeError, *_BROKEN_ZIP) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
-        raise ValueError(f"{path}: is not a readable clip ({error}); delete it.") from error
+        arrays = read_arrays(path)
+    except ValueError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            raise error.__cause__ from None
+        said = str(error).removeprefix(f"{path}: ")
+        raise ValueError(f"{path}: is not a readable clip ({said}); delete it.") from error
     found = str(arrays.pop(ORIGIN, "a clip of an earlier version"))
     if found != origin:
         raise ValueError(f"{path}: holds {found}, expected {origin}; delete it.")

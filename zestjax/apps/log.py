@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from zestjax.io.files import append_bytes, write_bytes
+from zestjax.io.reading import parse_json, read_regular
 
 PATIENCE = 50  # steps in a row whose loss may be non-finite before the run gives up
 CLOCK = ("step", "seconds", "seconds_per_step")
@@ -70,7 +71,7 @@ def read_log(path):
     """
     if not Path(path).exists():
         return [], 0
-    whole = Path(path).read_bytes().split(b"\n")[:-1]
+    whole = read_regular(path).split(b"\n")[:-1]
     lines = [line for text in whole if (line := _record(text)) is not None]
     return lines, len(whole) - len(lines)
 
@@ -78,8 +79,8 @@ def read_log(path):
 def _record(text):
     """A line's dict, or None if it is no record of a step."""
     try:
-        line = json.loads(text.decode("utf-8"))
-    except (ValueError, RecursionError):
+        line = parse_json(text)
+    except ValueError:
         return None
     return line if isinstance(line, dict) and type(line.get("step")) is int else None
 

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 MOST_BYTES = 2**30  # of a file: a depth map and a flow of 8K have 400 MB
+CHUNK = 2**20  # bytes
 MOST_JSON = 2**26  # bytes: a pose of 20 numbers has 500, so that 100,000 frames fit
 NUMPY, ZIP = b"\x93NUMPY", b"PK"
 MARKS = {b"\xff\xfe\0\0": "utf-32", b"\0\0\xfe\xff": "utf-32", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
@@ -51,8 +52,10 @@ def open_regular(path, *, most=MOST_BYTES):
 
 def read_regular(path, *, most=MOST_BYTES):
     """The bytes of a regular file; raises as `open_regular`."""
-    with open_regular(path, most=most) as (file, _):
-        content = file.read(most + 1)
+    with open_regular(path, most=most) as (file, size):
+        content = file.read(size)  # Python takes memory for as much as is asked for
+        while len(content) <= most and (more := file.read(CHUNK)):  # it grew, or its system does not say how large
+            content += more
         if len(content) > most:
             raise ValueError(_larger(path, most))
         return content
