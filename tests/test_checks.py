@@ -15,7 +15,8 @@ def test_sizes_are_returned_by_axis_name():
 @pytest.mark.parametrize(
     "shape, spec, words",
     [
-        ((2, 3), "... 2", ["axis 2", "is 3"]),
+        ((2, 3), "... 2", ["`second` should be (... 2), got shape (2, 3)"]),
+        ((5, 3, 4), "N 4 4", ["should be (N 4 4), got shape (5, 3, 4). A 3x4 pose needs the row 0 0 0 1 under it."]),
         ((2, 3), "N 3 3", ["shape (2, 3)", "N 3 3"]),
         ((2,), "", ["shape (2,)"]),
         ((4, 9), "... S C", ["axis S", "is 4", "expected 3", "from `first`"]),
@@ -28,7 +29,7 @@ def test_a_wrong_shape_is_refused_by_name(shape, spec, words):
 
 
 def test_shapes_are_checked_while_tracing():
-    with pytest.raises(ValueError, match="axis 3"):
+    with pytest.raises(ValueError, match=r"`x` should be \(... 3\), got shape \(2,\)"):
         jax.eval_shape(lambda x: check_shapes("f", x=(x, "... 3")), jnp.zeros(2))
 
 

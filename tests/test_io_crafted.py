@@ -135,6 +135,14 @@ def test_a_bad_camera_path_is_one_error_that_names_the_file(tmp_path, kind, suff
 
 
 @pytest.mark.parametrize("suffix", [".json", ".npz"])
+def test_a_path_of_poses_without_their_last_row_is_told_so(tmp_path, suffix):
+    path, content = tmp_path / f"p{suffix}", path_file(camera_from_world=np.zeros((2, 3, 4)).tolist())
+    path.write_text(json.dumps(content)) if suffix == ".json" else np.savez(path, **content)
+    with pytest.raises(ValueError, match=r"has shape \(2, 3, 4\), .* A 3x4 pose needs the row 0 0 0 1 under it"):
+        camera_path(str(path), video())
+
+
+@pytest.mark.parametrize("suffix", [".json", ".npz"])
 @pytest.mark.parametrize("content", [b"", b"[]", b"PK\3\4", b'{"a": 1}', b"[" * 10**5])
 def test_a_file_that_is_no_camera_path_is_named(tmp_path, suffix, content):
     (tmp_path / f"p{suffix}").write_bytes(content)

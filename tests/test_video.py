@@ -19,7 +19,7 @@ def video(**changes):
         ({"images": np.full((2, 4, 6, 3), 1.5, "f")}, "from 1.5 to 1.5"),
         ({"images": np.full((2, 4, 6, 3), np.nan, "f")}, "from nan"),
         ({"images": np.zeros((3, 4, 6, 3), "f")}, "axis N"),
-        ({"images": np.zeros((2, 4, 6, 4), "f")}, "axis 3"),
+        ({"images": np.zeros((2, 4, 6, 4), "f")}, r"`images` should be \(N H W 3\), got shape \(2, 4, 6, 4\)"),
         ({"images": np.zeros((2, 0, 6, 3), "f")}, r"shape \(2, 0, 6, 3\)"),
         ({"cameras": Camera(np.zeros((2, 3, 3), "f"), np.tile(np.eye(4, dtype="f"), (2, 1, 1)))}, "intrinsics"),
         ({"near": np.float32(6)}, "0 < near < far"),

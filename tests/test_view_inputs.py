@@ -83,7 +83,7 @@ MATRICES = [
     Bad("a scaled pose", posed(lambda p: p * 2), "`camera_from_world` is not rigid"),
     Bad("a mirror", posed(lambda p: np.diag([-1, 1, 1, 1]) @ p), "`camera_from_world` is a reflection"),
     Bad("a pose's last row", posed(entry(3, 0, value=1)), r"`camera_from_world` does not end in \(0, 0, 0, 1\)"),
-    Bad("a pose of three rows", posed(lambda p: p[..., :3, :]), r"axis 4 of `camera_from_world` is 3, expected 4"),
+    Bad("a pose of three rows", posed(lambda p: p[..., :3, :]), r"4 4\), got shape .*3, 4\). A 3x4 pose needs"),
 ]
 VIDEOS = [
     *MATRICES,
@@ -91,7 +91,7 @@ VIDEOS = [
     Bad("integers", painted(lambda i: np.int32(i * 255)), r"`images` should be floats .*int32.*; divide bytes by 255"),
     Bad("below 0", painted(lambda i: 2 * i - 1), r"`images` should be floats .* got float32 .* from -0\.\d+ to"),
     Bad("a colour that is NaN", painted(lambda i: np.where(i > 0.8, np.nan, i)), "`images` should be .* from nan"),
-    Bad("four channels", painted(lambda i: i[..., [0, 1, 2, 0]]), "axis 3 of `images` is 4, expected 3"),
+    Bad("four channels", painted(lambda i: i[..., [0, 1, 2, 0]]), r"`images` .* 3\), got shape \(6, 16, 24, 4\)"),
     Bad("one image", painted(lambda i: i[0]), r"`images` should be \(N H W 3\), got shape \(16, 24, 3\)"),
     Bad("one frame", lambda v: v._replace(images=v.images[:1], cameras=select(v.cameras, [0])), "has 1 frame"),
     Bad("a camera too few", lambda v: v._replace(cameras=select(v.cameras, slice(LAST))),

@@ -31,6 +31,8 @@ def check_shapes(where, /, **arrays):
             batches[name] = shape[: len(shape) - len(axes)]
         for axis, size in zip(axes, shape[len(shape) - len(axes) :], strict=True):
             want = int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
+            if size != want and axis.isdigit():
+                raise ValueError(f"{where}: `{name}` should be ({spec}), got shape {shape}.{pose_hint(shape, axes)}")
             if size != want:
                 source = f" from `{first[axis]}`" if axis in first else ""
                 raise ValueError(
@@ -40,6 +42,12 @@ def check_shapes(where, /, **arrays):
             first.setdefault(axis, name)
     _check_batches(where, batches)
     return sizes
+
+
+def pose_hint(shape, wanted):
+    """A sentence on what a 3x4 pose lacks where a 4x4 one is wanted, else nothing; `wanted`: sizes of the axes."""
+    meant = tuple(shape[-2:]) == (3, 4) and [str(size) for size in wanted[-2:]] == ["4", "4"]
+    return " A 3x4 pose needs the row 0 0 0 1 under it." if meant else ""
 
 
 def _check_batches(where, batches):

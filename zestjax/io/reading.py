@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from zestjax.checks import pose_hint
+
 MOST_BYTES = 2**30  # of a file: a depth map and a flow of 8K have 400 MB
 CHUNK = 2**20  # bytes
 MOST_JSON = 2**26  # bytes: a pose of 20 numbers has 500, so that 100,000 frames fit
@@ -124,8 +126,9 @@ def check_numbers(path, array, *, shape=None, name=None, finite=False):
     if shape is not None and (
         array.ndim != len(shape) or any(w not in (None, h) for h, w in zip(array.shape, shape, strict=True))
     ):
+        hint = pose_hint(array.shape, shape)
         wanted = " x ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{path}: {what} has shape {array.shape}, expected {wanted}; write it again.")
+        raise ValueError(f"{path}: {what} has shape {array.shape}, expected {wanted}; write it again.{hint}")
     if finite and not np.isfinite(array).all():
         raise ValueError(f"{path}: {what} has values that are not finite; write it again.")
     return array
