@@ -279,6 +279,9 @@ def test_a_place_is_tried_without_being_made(tmp_path):
     (tmp_path / "link").symlink_to("nowhere/at/all")
     check_writable(tmp_path / "link")
     assert os.listdir(tmp_path) == ["link"]
+    if Path("/proc/self").exists():
+        with pytest.raises(OSError, match="choose another place|that can be written to"):
+            check_writable("/proc/zestjax")
     for out, words in (("/proc/1/x", "Permission denied|Read-only|No such"), ("/dev/null/x", "Not a directory")):
         with pytest.raises(OSError, match=words):
             check_writable(out)

@@ -18,6 +18,7 @@ _REMEDIES = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _SPACE),
     **dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM), _RIGHTS),
     **dict.fromkeys((errno.ENOTDIR, errno.EEXIST), "a file lies where a folder is needed: choose another place"),
+    errno.ENOENT: "no file can be made there: choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
 }
 
@@ -35,18 +36,19 @@ def check_writable(folder):
     """Refuse a folder that nothing can be written to, before any work is done for it. It may be missing.
 
     Raises:
-      WriteError: it, or the nearest folder above it that exists, is a file, on a read-only disk or not the user's.
+      WriteError: it, or the nearest folder above it that exists, is a file, or takes none: a full or read-only disk,
+        another user's, or no place for files at all, as /proc.
     """
     place = resolved(folder)
     while not place.exists():
         place = place.parent
-    number = None
-    if not place.is_dir():
-        number = errno.ENOTDIR
-    elif not os.access(place, os.W_OK | os.X_OK):
-        number = errno.EROFS if os.statvfs(place).f_flag & os.ST_RDONLY else errno.EACCES
-    if number is not None:
-        raise WriteError(number, f"{os.strerror(number)}; {remedy(number)}", str(folder))
+    try:
+        if not place.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, "a file")
+        tempfile.TemporaryFile(dir=place).close()  # rights alone do not tell: root has them in /proc too
+    except OSError as error:
+        number = error.errno or errno.EIO
+        raise WriteError(number, f"{os.strerror(number)}; {remedy(number)}", str(folder)) from error
 
 
 def resolved(path):
