@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import os
+import warnings
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from zestjax import novel_view
-from zestjax.apps import cache, frontier
+from zestjax.apps import cache, frontier, tables
 from zestjax.apps.host import host_camera, host_video
 from zestjax.apps.producer import ProducerError
 from zestjax.apps.train import TrainOptions, fresh
@@ -114,6 +115,54 @@ def test_the_strict_protocol_never_shows_a_target_to_the_model(places, grey, mon
     )
     assert run(places, "evaluate", "--protocol", "strict", "--targets", "1,4", "--no-pictures", "--quiet") == 0
     assert set(asked) == {(1, (1,)), (4, (4,))}
+
+
+def test_evaluate_says_once_what_a_scene_lacks_and_what_is_null_for_it(places, grey, capsys):
+    flags = ("--no-pictures", "--out", str(places / "out/lacking"))
+    assert run(places, "evaluate", *flags) == 0
+    told = lambda: [line for line in capsys.readouterr().err.splitlines() if "null in" in line]
+    ceiling = "no ceiling without the exact answers for held-out cameras that bench:NAME alone has"
+    assert told() == [f"evaluate: toy: {ceiling}; null in metrics.json"]
+    assert run(places, "evaluate", "--protocol", "strict", *flags) == 0
+    masks = "no score of dynamic and static pixels without masks (motion_masks/, mv_masks/)"
+    truth = "no depth error without true depth (truth/), no flow error without true flow (truth/)"
+    assert told() == [f"evaluate: toy: {masks}, {truth}, {ceiling}; null in metrics.json"]
+    report = json.loads((places / "out/lacking/metrics.json").read_text())
+    assert report["mean"]["dynamic"] is report["mean"]["depth_abs_rel"] is report["ceiling"] is None
+    assert tables.lacking("all", tables.NEEDS) is None
+
+
+def test_pictures_are_enlarged_with_a_word_unless_a_size_is_asked_for(places, grey, capsys):
+    config = preset("tiny", height=64, width=96)
+    shapes = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
+    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    save_weights(places / "tall.safetensors", zeros, metadata={"config": dataclasses.asdict(config), "seed": 0})
+    flags = ("--path", "frames", "--frames", "2", "--out", str(places / "out/tall"))
+    warned = lambda: [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert run(places, "render", *flags, weights="tall") == 0
+        (line,) = warned()
+        assert line.endswith(
+            "scene: pictures of 32x48 (HxW) are enlarged to 64x96, the preset's height; "
+            "`--size HxW`, where a command has it, sets another."
+        )
+        assert run(places, "render", *flags, "--size", "64x96", weights="tall") == 0
+        assert run(places, "render", *flags) == 0  # of the preset's own height
+        assert run(places, "render", *flags, "--quiet", weights="tall") == 0
+        assert warned() == []
+
+
+def test_one_frame_is_not_called_frames(places, grey, capsys):
+    for count, words in (("1", "render: 1 frame of 32x48, "), ("2", "render: 2 frames of 32x48, ")):
+        assert run(places, "render", "--frames", count, "--out", str(places / "out/one")) == 0
+        assert capsys.readouterr().out.startswith(words)
+
+
+def test_a_scene_that_is_not_there_is_told_of_the_bench(places, grey, capsys):
+    flags = ["--weights", str(places / "tiny.safetensors"), "--out", str(places / "out/absent")]
+    refused(capsys, main(["evaluate", "--scene", "walker", *flags]), "walker: is not a folder", "mean bench:walker?")
+    refused(capsys, main(["render", "--scene", "holiday", *flags]), "holiday: is not a folder", "bench:NAME", "marbles")
 
 
 def test_quiet_is_silent(places, grey, capsys):
@@ -276,6 +325,17 @@ def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(command, p
             capsys, main([command, *flags, "--out", str(tmp_path / out)]), out, "a file lies where", "another place"
         )
     assert (tmp_path / "file").read_text() == "x"
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a folder that takes no files, even from root")
+@pytest.mark.parametrize("command", ["train", "render", "import-mvsnerf"])
+def test_a_place_that_takes_no_files_is_found_before_the_work(command, places, capsys, monkeypatch):
+    def work(options):
+        raise AssertionError("it began")
+
+    monkeypatch.setattr(f"zestjax.apps.commands._run_{command.replace('-', '_')}", work)
+    flags = {"render": ["--scene", str(places / "scene")], "import-mvsnerf": ["x.tar"]}.get(command, [])
+    refused(capsys, main([command, *flags, "--out", "/proc/zestjax"]), "/proc")
 
 
 def test_an_imported_file_is_not_a_folder(capsys, tmp_path):

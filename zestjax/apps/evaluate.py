@@ -5,6 +5,7 @@ what is done once for a video (`prepare`) and the compile stand beside them.
 """
 
 import dataclasses
+import sys
 import time
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from zestjax.apps import results
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
-from zestjax.apps.tables import headline, write_table
+from zestjax.apps.tables import counted, headline, lacking, write_table
 from zestjax.apps.weights import PUBLISHED, arithmetic, at_precision, open_weights, standing_still
 from zestjax.io.figures import depth_picture, error_picture, share_picture, side_by_side
 from zestjax.io.lpips import load_lpips
@@ -71,7 +72,9 @@ def _evaluate(model, options):
     for name in BENCH:
         reports.append(evaluate_scene(model, dataclasses.replace(options, scene=f"bench:{name}"), out / name))
         write_table(out, reports)
-    return f"evaluate: mean of {len(reports)} scenes: {headline(write_table(out, reports))}: {out / 'table.md'}"
+    return (
+        f"evaluate: mean of {counted(len(reports), 'scene')}: {headline(write_table(out, reports))}: {out / 'table.md'}"
+    )
 
 
 def evaluate_scene(model, options, out):
@@ -90,11 +93,15 @@ def score_scene(view_of, opened, options, out):
     """Score an opened scene's targets with its `Renderer`; see `evaluate_scene`."""
     scene, model, rows = opened.scene, view_of.model, []
     lpips = None if options.lpips is None else load_lpips(options.lpips)
+    given = set() if opened.ceiling is None else {"ceiling"}
     planned = [{"file": picture_name(target)} for target in scene.targets if options.pictures]
     results.begin(out / "metrics.json", picture_names, {"scene": scene.name, "unfinished": True, "targets": planned})
     for target in progress(scene.targets, scene.name, quiet=options.quiet):
         shown = out if options.pictures else None
         rows.append(evaluate_target(view_of, scene, target, opened.ceiling, shown, lpips))
+        given |= {truth for truth in ("dynamic", "depth", "flow") if getattr(target, truth) is not None}
+    if (lacks := lacking(scene.name, given)) and not options.quiet:
+        print(f"evaluate: {lacks}", file=sys.stderr)
     height, width = scene.video.images.shape[1:3]
     report = {
         "scene": scene.name, "system": model.system, "protocol": options.protocol, "height": height, "width": width,

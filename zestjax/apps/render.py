@@ -12,6 +12,7 @@ from zestjax.apps.paths import camera_path
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import number
+from zestjax.apps.tables import counted
 from zestjax.apps.weights import arithmetic, at_precision, open_weights, standing_still
 from zestjax.cameras import resized
 from zestjax.inputs import check_target
@@ -76,7 +77,7 @@ def _render(options):
     told |= timing(seconds) | {"video": film.name}
     results.write_record(out / "timing.json", told)
     return (
-        f"render: {count} frames of {size[0]}x{size[1]}, {told['seconds_per_frame']:.2f} s each "
+        f"render: {counted(count, 'frame')} of {size[0]}x{size[1]}, {told['seconds_per_frame']:.2f} s each "
         f"({told['seconds']:.0f} s in all): {film}"
     )
 

@@ -1,7 +1,9 @@
 """A scene by the name a user gives it: a folder in any supported layout, or `bench:NAME` of zest-bench."""
 
 import hashlib
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -13,6 +15,7 @@ from zestjax.cameras import project, unproject
 from zestjax.checks import check_option
 from zestjax.io.files import resolved
 from zestjax.io.scenes import PROTOCOLS, Scene, Target, load_scene
+from zestjax.simulate.bench import BENCH
 
 BENCH_SIZE = (144, 256)
 
@@ -42,16 +45,35 @@ def open_scene(name, config, *, size=None, protocol: str | None = "held-out", ta
 
     Raises:
       ValueError: no such scene, protocol or target.
+
+    Warns:
+      UserWarning: no size was asked for, and a folder's pictures are smaller than the preset's.
     """
     name = str(name)
     if name.startswith("bench:"):
         check_option("open_scene", protocol=(protocol, (*PROTOCOLS, None)))
         return _open_bench(name.removeprefix("bench:"), size or BENCH_SIZE, protocol, targets, exclude)
+    if not Path(name).exists():
+        hint = f"; did you mean bench:{name}?" if name in BENCH else f", one of {', '.join(BENCH)}."
+        raise ValueError(f"{name}: is not a folder; give one that holds a scene, or bench:NAME of zest-bench{hint}")
     height, width = size or (config.height, None)
     scene = load_scene(
         name, height=height, width=width, layout=layout, protocol=protocol or "strict", targets=targets, exclude=exclude
     )
+    if size is None:
+        _tell_enlarged(name, scene)
     return Opened(scene, None)
+
+
+def _tell_enlarged(name, scene):
+    """Warn of pictures that are brought to a height which they do not have and nobody asked for."""
+    have, now = scene.stored, scene.video.images.shape[1:3]
+    if have[0] < now[0]:
+        warnings.warn(
+            f"{name}: pictures of {have[0]}x{have[1]} (HxW) are enlarged to {now[0]}x{now[1]}, the preset's height; "
+            "`--size HxW`, where a command has it, sets another.",
+            stacklevel=3,
+        )
 
 
 def place_of(name):

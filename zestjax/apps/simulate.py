@@ -8,6 +8,7 @@ import numpy as np
 
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import target_from_answers
+from zestjax.apps.tables import counted
 from zestjax.io.nsff import write_nsff
 
 OTHERS = 11  # held-out views of a time
@@ -57,7 +58,7 @@ def simulate(options):
         flow_forward=forward, flow_backward=backward, truth=truth, held_out=targets(),
     )  # fmt: skip
     height, width = video.images.shape[1:3]
-    return f"simulate: {simulated.name}, {count} frames of {height}x{width}: {options.out}"
+    return f"simulate: {simulated.name}, {counted(count, 'frame')} of {height}x{width}: {options.out}"
 
 
 def _scene(options):

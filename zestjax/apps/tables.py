@@ -12,6 +12,26 @@ HEAD = (
 )
 
 
+NEEDS = {
+    "dynamic": ("score of dynamic and static pixels", "masks (motion_masks/, mv_masks/)"),
+    "depth": ("depth error", "true depth (truth/)"),
+    "flow": ("flow error", "true flow (truth/)"),
+    "ceiling": ("ceiling", "the exact answers for held-out cameras that bench:NAME alone has"),
+}
+"""By what a scene may give: what a report has of it, and what that needs, in words."""
+
+
+def lacking(name, given):
+    """A sentence on what a scene's report cannot have, and why; None where it has all; `given`: names of `NEEDS`."""
+    missing = [f"no {score} without {need}" for key, (score, need) in NEEDS.items() if key not in given]
+    return f"{name}: {', '.join(missing)}; null in metrics.json" if missing else None
+
+
+def counted(count, what):
+    """A number of things: `1 frame`, `2 frames`."""
+    return f"{count} {what}{'s' * (count != 1)}"
+
+
 def headline(report):
     """PSNR by region against the better floor, and the seconds: one line."""
     mean = report["mean"]

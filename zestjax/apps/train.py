@@ -18,6 +18,7 @@ from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
 from zestjax.apps.producer import ClipSource
 from zestjax.apps.scenes import digest, open_scene, place_of
+from zestjax.apps.tables import counted
 from zestjax.apps.weights import SYSTEMS, arithmetic
 from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
 from zestjax.checks import check_option
@@ -182,7 +183,9 @@ def summarise(result, out, verb):
     spent = f"{rate:.2f} s a step, compile {result.compile_seconds:.0f} s" if result.steps else "nothing was left to do"
     ended = "" if result.finished else " (interrupted)"
     return Summary(
-        f"{verb}: {state.step} steps in {result.seconds:.0f} s ({spent}){said}: {weights}{ended}", weights, result
+        f"{verb}: {counted(state.step, 'step')} in {result.seconds:.0f} s ({spent}){said}: {weights}{ended}",
+        weights,
+        result,
     )
 
 

@@ -82,8 +82,8 @@ class Scene:
     """A scene in memory, as numpy arrays.
 
     name, layout: str. video: `Video`. targets: sequence of `Target`, which may read them as it goes. motion_masks:
-    (N, H, W) bool. flow_forward, flow_backward: `Flow`. disparity: (N, H, W), up to scale and shift. What a scene
-    lacks is None.
+    (N, H, W) bool. flow_forward, flow_backward: `Flow`. disparity: (N, H, W), up to scale and shift. stored: (height,
+    width) of the first picture's file. What a scene lacks is None.
     """
 
     name: str
@@ -94,6 +94,7 @@ class Scene:
     flow_backward: Flow | None = None
     disparity: np.ndarray | None = None
     layout: str = ""
+    stored: tuple[int, int] | None = None
 
 
 def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out", targets=None, exclude=()):
@@ -129,7 +130,8 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
     if outside := [i for i in exclude if not 0 <= i < len(record.images)]:
         raise ValueError(f"{path}: no frame {outside[0]} to exclude; the video has 0 to {len(record.images) - 1}.")
     shown = [i for i in range(len(record.images)) if i not in set(exclude)]
-    size = _size(image_size(record.images[shown[0] if shown else 0]), height, width)
+    stored = image_size(record.images[shown[0] if shown else 0])
+    size = _size(stored, height, width)
     images = np.zeros((len(record.images), *size, 3), np.float32)
     for i in shown:
         images[i] = resize_area(read_image(record.images[i], native=record.size), *size)
@@ -147,6 +149,7 @@ def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out
         flow_backward=flow_of(record, record.flow_backward, size),
         disparity=disparity_of(record, size),
         layout=record.layout,
+        stored=stored,
     )
 
 
