@@ -13,10 +13,10 @@ from pathlib import Path
 
 from zestjax.apps.evaluate import EvaluateOptions, evaluate
 from zestjax.apps.train import TrainOptions, train
-from zestjax.apps.weights import SYSTEMS
 from zestjax.io.files import write_bytes
 from zestjax.io.weights import read_metadata
-from zestjax.presets import preset
+from zestjax.systems.presets import ABLATED
+from zestjax.train.recipes import RECIPES
 
 PAPER = {"zest": 21.59, "zest-motion": 20.19, "zest-geometry": 17.87, "zest-none": 12.67}
 COLUMNS = ("system", "full PSNR / SSIM", "dynamic", "static", "s / frame", "steps", "s training", "the paper's PSNR")
@@ -32,9 +32,9 @@ def measured(system, options):
             clips=options.out / "clips", clip_count=options.clips, window=min(64, options.clips),
             steps_per_clip=max(1, options.steps // options.clips),
         ))  # fmt: skip
-    config = preset(options.preset)
+    height = RECIPES[options.preset].height
     evaluate(EvaluateOptions(
-        "bench:all", out / "bench", weights, size=(config.height, 16 * config.height // 9), targets=options.targets,
+        "bench:all", out / "bench", weights, size=(height, 16 * height // 9), targets=options.targets,
     ))  # fmt: skip
     mean = json.loads((out / "bench" / "metrics.json").read_text())["mean"]
     run = read_metadata(weights)
@@ -61,14 +61,14 @@ def main():
     """Run the ablation."""
     parser = argparse.ArgumentParser(description="Geometry and motion volumes, each or both or neither.")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--preset", default="tiny")
+    parser.add_argument("--preset", default="tiny", choices=tuple(RECIPES))
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--clips", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--targets", type=lambda text: tuple(map(int, text.split(","))), default=(6, 14))
     options = parser.parse_args()
     rows = []
-    for system in sorted(SYSTEMS, key=lambda name: -PAPER[name]):
+    for system in sorted(ABLATED, key=lambda name: -PAPER[name]):
         rows.append(measured(system, options))
         write_bytes(options.out / "ablation.json", (json.dumps(rows, indent=1) + "\n").encode())
         write_bytes(options.out / "ablation.md", "\n".join([*head(), *map(line, rows), ""]).encode())

@@ -20,14 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 import parity_arrays as arrays
 
-from zestjax import mvsnerf
+from zestjax.base.checks import check_shapes
 from zestjax.cameras import rigid_inverse
-from zestjax.checks import check_shapes
 from zestjax.io.mvsnerf import read_mvsnerf
 from zestjax.io.reading import read_arrays
 from zestjax.io.weights import WeightsError
 from zestjax.nets.feature_pyramid import imagenet_normalised
 from zestjax.rendering import alpha_from_density, weights_from_density
+from zestjax.systems import mvsnerf
 
 INPUTS = {
     "imgs01": "views 3 H W", "w2cs": "views 4 4", "intrinsics": "views 3 3", "near_far": "2",
@@ -68,8 +68,8 @@ FAMILIES = {
     r"raw_rgbsigma": arrays.field_outputs,
     r"alpha": lambda golden: arrays.absorbed(golden, alpha_from_density),
     r"weights": lambda golden: arrays.absorbed(golden, weights_from_density),
-    r"rgb_map": lambda golden: golden.rendered().colour,
-    r"depth_map": lambda golden: golden.rendered().depth,
+    r"rgb_map": lambda golden: golden.rendered()[0],
+    r"depth_map": lambda golden: golden.rendered()[1],
 }
 """What computes the arrays whose names match: a function of `Golden` and of what the name says."""
 NAMES = """imgs_norm c2ws proj_mats depth_values feat_conv0_0_train feat_conv2_train feats_train feats_eval creg_conv0

@@ -29,10 +29,13 @@ import numpy as np
 
 from zestjax.apps.host import host_camera, host_video
 from zestjax.apps.paths import camera_path
+from zestjax.apps.weights import recipe_from_metadata
+from zestjax.base.parts import to_stored
 from zestjax.io.reading import FileWarning
 from zestjax.io.scenes import load_scene
 from zestjax.io.torch_files import LEGACY_MAGIC, read_torch
-from zestjax.io.weights import load_weights, save_weights
+from zestjax.io.weights import WeightsError, load_weights, save_weights
+from zestjax.train.recipes import TINY
 
 N, HEIGHT, WIDTH = 3, 24, 32
 MOST_MEMORY = 3 * 2**30  # bytes of address space that loading a file of a few kB may take
@@ -163,8 +166,23 @@ def camera_file(suffix, retell):
 
 def weights(folder):
     tree = {"kernel": np.ones((4, 5), np.float32), "bias": np.zeros(5, np.float32)}
-    save_weights(folder / "w.safetensors", tree, metadata={"config": {"name": "tiny"}})
-    return Case(folder / "w.safetensors", lambda: load_weights(folder / "w.safetensors", like=tree), retold_header)
+    file = folder / "w.safetensors"
+    save_weights(file, tree, metadata={"recipe": to_stored(TINY)})
+
+    def retell(rng, content):
+        if rng.random() < 0.5:
+            return retold_header(rng, content)
+        save_weights(file, tree, metadata={"recipe": with_odd_value(rng, to_stored(TINY))})  # counted right
+        return file.read_bytes()
+
+    def load():
+        _, metadata = load_weights(file, like=tree)
+        try:
+            return recipe_from_metadata(metadata)
+        except WeightsError as error:
+            raise WeightsError(f"{file}: {error}") from error  # as `open_weights` does
+
+    return Case(file, load, retell)
 
 
 def torch(*, legacy):
@@ -246,16 +264,21 @@ def retold_zip(rng, content):
 
 def retold_json(rng, content):
     """JSON of which one value, at any depth, is odd; or in another encoding, or nested without end."""
-    found = json.loads(content)
-    holder, key = {"all": found}, "all"
+    text = json.dumps(with_odd_value(rng, json.loads(content)))
+    deep = rng.choice([10, 1000, 10**5])
+    odd = [text.encode("utf-16"), text.encode("utf-8-sig"), b"[" * deep, b'{"poses":' * deep, text.encode() + b"}"]
+    return rng.choice(odd) if rng.random() < 0.2 else text.encode()
+
+
+def with_odd_value(rng, found):
+    """What JSON held, one value of it at any depth made odd."""
+    whole = holder = {"all": found}
+    key = "all"
     while isinstance(holder[key], dict | list) and holder[key] and rng.random() < 0.8:
         holder = holder[key]
         key = rng.choice(sorted(holder)) if isinstance(holder, dict) else rng.randrange(len(holder))
     holder[key] = rng.choice(ODD)
-    text = json.dumps(found)
-    deep = rng.choice([10, 1000, 10**5])
-    odd = [text.encode("utf-16"), text.encode("utf-8-sig"), b"[" * deep, b'{"poses":' * deep, text.encode() + b"}"]
-    return rng.choice(odd) if rng.random() < 0.2 else text.encode()
+    return whole["all"]
 
 
 def retold_header(rng, content):

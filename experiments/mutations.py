@@ -16,7 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 MUTATIONS = {
-    "numerics": [
+    "base/numerics": [
         ("jnp.sqrt(jnp.where(positive, x, 1))", "jnp.sqrt(x)"),
         ("_quotient(numerator, jnp.where(zero, 1, denominator))", "_quotient(numerator, denominator)"),
         ("(tangents[0] - quotient * tangents[1]) / primals[1]",
@@ -61,7 +61,7 @@ MUTATIONS = {
         ("if border == \"zero\":\n        cells = jnp.where(inside[..., None], cells, 0)", "if False:\n        pass"),
         ("return jnp.where(inside[..., None], values, 0) if border == \"zero\" else values", "return values"),
     ],
-    "trust": [
+    "frames/trust": [
         ("tolerance = jnp.maximum(tolerance, NARROWEST)", "tolerance = tolerance"),
         ("return jnp.where(far, FARTHEST, distance / jnp.where(far, 1, tolerance))", "return distance / tolerance"),
     ],
@@ -138,7 +138,7 @@ def killed_by(folder, module, guard, instead):
     if guard not in source:
         raise SystemExit(f"mutations: `{guard}` is no longer in {module}.py; bring the list up to date.")
     path.write_text(source.replace(guard, instead))
-    files = [f"tests/test_{name}.py" for name in (*TESTS.get(module, [module]), "hard_cases")]
+    files = [f"tests/test_{name}.py" for name in (*TESTS.get(module, [module.rsplit("/")[-1]]), "hard_cases")]
     flags = "--xla_backend_optimization_level=1"
     environment = os.environ | {"PYTHONPATH": str(folder), "XLA_FLAGS": flags, "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *files]

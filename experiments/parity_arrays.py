@@ -15,16 +15,19 @@ import re
 import jax
 import jax.numpy as jnp
 
-from zestjax import mvsnerf
+from zestjax.base.numerics import matvec
 from zestjax.cameras import Camera, scaled
+from zestjax.depth import expected_depth
 from zestjax.nets.conv3d import conv3d, conv3d_transpose
 from zestjax.nets.cost_regulariser import cost_regulariser
 from zestjax.nets.feature_pyramid import STRIDES, feature_pyramid, imagenet_normalised
 from zestjax.nets.layers import block2d, norm_act
 from zestjax.nets.positional import positional_encoding
-from zestjax.numerics import matvec
 from zestjax.planesweep import carry, homographies, plane_depths, sweep_grid, warp
 from zestjax.rays import rays_from_pixels
+from zestjax.rendering import composite, weights_from_density
+from zestjax.systems import mvsnerf
+from zestjax.systems.fields import Marched, Seen
 
 CELLS_KEPT = (8, 4, 4)  # of the full volume one in so many along each axis, where shapes do not say otherwise
 PLANES_KEPT = 5  # of a warped view one in so many, likewise
@@ -81,8 +84,16 @@ def _warped(features, warps, *, cells, padding):
 
 @functools.partial(jax.jit, static_argnames="padding")
 def _rendered(params, built, sources, camera, pixels, depths, *, padding):
-    built = jnp.moveaxis(built, 0, -1)
-    return mvsnerf.render(params, built, sources, camera, pixels, depths=depths, padding=padding)
+    """Colours (R, 3) and depths (R,) of pixels of a camera: `systems.system.render` with samples at given depths."""
+    rays, reference = rays_from_pixels(camera, pixels), mvsnerf.reference(sources)
+    points = rays.origins[:, None] + depths[..., None] * rays.directions[:, None]
+    unit = rays.directions / jnp.linalg.norm(rays.directions, axis=-1, keepdims=True)
+    turned = matvec(reference.camera_from_world[:3, :3], unit)
+    marched = Marched(depths, points, points, points, jnp.ones_like(depths), turned)  # nothing asks for its coords
+    seen = Seen(jnp.moveaxis(built, 0, -1), sources)
+    found = mvsnerf.MvsNerf(padding=padding)(params, seen, marched, None)
+    weights = weights_from_density(found.density, marched.lengths)
+    return composite(weights, found.colour).values, expected_depth(weights, depths, background=0.0)
 
 
 def paddings_of(record):
@@ -181,7 +192,7 @@ class Golden:
         return pixels, rays_from_pixels(self.target, pixels)
 
     def rendered(self):
-        """`mvsnerf.Rendered`, of the images."""
+        """Colours and depths, of the images; see `_rendered`."""
         built, depths = self.volumes(self.padding, "train")[1], self.stored("z_jit")
         compute = lambda: _rendered(
             self.weights.train, built, self.sources, self.target, self.rays()[0], depths, padding=self.padding

@@ -15,14 +15,14 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from zestjax import batches, learn
 from zestjax.apps.evaluate import Renderer, device_name
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, score_image
 from zestjax.apps.weights import arithmetic, at_precision, open_weights
+from zestjax.base.precision import PRECISIONS
 from zestjax.io.files import write_bytes
-from zestjax.precision import PRECISIONS
 from zestjax.simulate.clips import training_clip
+from zestjax.train import batches
 
 COLUMNS = (
     "precision", "full PSNR", "dynamic", "static", "colour from float64's", "depth from float64's",
@@ -34,7 +34,7 @@ def views(model, options):
     """Scores, colours and depths of all targets, and the seconds of each."""
     scores, colours, depths, seconds, compiling = [], [], [], [], []
     for name in options.scenes:
-        scene = open_scene(f"bench:{name}", model.config, targets=options.times).scene
+        scene = open_scene(f"bench:{name}", model.recipe, targets=options.times).scene
         view_of = Renderer(model, scene.video, steady=True)
         for target in scene.targets:
             view, took = view_of(target.camera, target.time)
@@ -48,8 +48,8 @@ def views(model, options):
 
 def gradient(model, batch):
     """The gradient of a training step as one float64 vector, and the seconds it takes."""
-    step = jax.jit(lambda params, batch: learn.step_gradients(model.config)(params, batch)[0])
-    run = lambda: jax.block_until_ready(step(model.params, batch))
+    step = jax.jit(jax.grad(model.recipe.objective(), has_aux=True))
+    run = lambda: jax.block_until_ready(step(model.params, batch)[0])
     for _ in range(2):
         run()
     start = time.perf_counter()
@@ -61,10 +61,10 @@ def gradient(model, batch):
 def measured(options):
     """One row a precision; float64, the exact one, is last."""
     model, rows, kept = open_weights(), [], []
-    clip = training_clip(jax.random.key(options.seed), height=model.config.height, width=model.config.width)
-    batch = batches.batch_from_clip(
-        jax.random.key(0), batches.prepare_clip(jax.random.key(1), clip, model.config), model.config
-    )
+    recipe = model.recipe
+    clip = training_clip(jax.random.key(options.seed), height=recipe.height, width=recipe.width)
+    prepared = batches.prepare_clip(jax.random.key(1), clip, recipe.system)
+    batch = batches.batch_from_clip(jax.random.key(0), prepared, recipe)
     for precision in PRECISIONS:
         chosen = at_precision(model, precision)
         with arithmetic(precision):

@@ -15,17 +15,18 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from zestjax import batches, learn, model
 from zestjax.apps.progress import progress
+from zestjax.base.trees import first_nonfinite
 from zestjax.io.files import write_bytes
 from zestjax.losses.objective import PAPER_WEIGHTS
-from zestjax.presets import preset
 from zestjax.simulate.clips import clip
 from zestjax.simulate.random import random_scene
-from zestjax.trees import first_nonfinite
+from zestjax.train import batches
+from zestjax.train.learn import SIMULATED_WEIGHTS
+from zestjax.train.recipes import recipe_of
 
 GREY = np.uint32(0x80808080)
-LOSSES = {"frames": learn.FRAME_WEIGHTS, "paper": PAPER_WEIGHTS}
+LOSSES = {"simulated": SIMULATED_WEIGHTS, "paper": PAPER_WEIGHTS}
 
 
 def of_bodies(drawn, change):
@@ -86,37 +87,37 @@ KINDS = {
 """What makes a scene nasty, as a change of a `RandomScene`."""
 
 
-def prepared_clips(config, options):
+def prepared_clips(recipe, options):
     """[(kind, `PreparedClip`)] of every kind in turn."""
-    size, found = dict(height=config.height, width=config.width), []
+    size, found = dict(height=recipe.height, width=recipe.width), []
     for index in progress(range(options.scenes), "scenes", quiet=options.quiet):
         key = jax.random.fold_in(jax.random.key(options.seed), index)
         drawn = random_scene(key, frames=8, targets=4, **size)
         for name, change in KINDS.items():
             taken = clip(key, change(drawn), **size, slack=(0.1, 0.1))
-            found.append((name, batches.prepare_clip(key, taken, config)))
+            found.append((name, batches.prepare_clip(key, taken, recipe.system)))
     return found
 
 
-def trained(config, clips, options):
+def trained(recipe, clips, options):
     """The last parameters, how many steps were skipped, the losses of each kind, and the seconds of a step."""
-    init, step = learn.make_train_step(config, steps=options.steps, weights=LOSSES[options.losses])
-    params: model.ZestParams = model.init_params(jax.random.key(options.seed), config)
+    init, step = recipe.trainer(steps=options.steps)
+    step, params = jax.jit(step, donate_argnums=(0, 1)), recipe.system.init(jax.random.key(options.seed))
     state, losses, seconds = init(params), {name: [] for name in KINDS}, []
     for number in progress(range(options.steps), "steps", quiet=options.quiet):
         kind, prepared = clips[number % len(clips)]
-        batch = batches.batch_from_clip(jax.random.key(number), prepared, config)
+        batch = batches.batch_from_clip(jax.random.key(number), prepared, recipe)
         start = time.perf_counter()
-        params, state, info = step(params, state, batch)
-        losses[kind].append({name: float(value) for name, value in info.items() if value is not None})
+        params, state, terms = step(params, state, batch)
+        losses[kind].append({name: float(value) for name, value in terms.items()})
         seconds.append(time.perf_counter() - start)
     return params, int(state.skipped), losses, float(np.median(seconds))
 
 
 def stability(options):
     """Run it; the report, whose `finite` says whether everything was."""
-    config = preset("tiny", precision=options.precision)
-    params, skipped, losses, seconds = trained(config, prepared_clips(config, options), options)
+    recipe = recipe_of("tiny", precision=options.precision).weighted(LOSSES[options.losses])
+    params, skipped, losses, seconds = trained(recipe, prepared_clips(recipe, options), options)
     totals = {kind: np.array([row["total"] for row in rows]) for kind, rows in losses.items()}
     finite = all(np.isfinite(list(row.values())).all() for rows in losses.values() for row in rows)
     lost = first_nonfinite(params)
@@ -137,7 +138,7 @@ def parsed(arguments=None):
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--scenes", type=int, default=6, help="drawn of each kind")
-    parser.add_argument("--losses", choices=tuple(LOSSES), default="frames")
+    parser.add_argument("--losses", choices=tuple(LOSSES), default="simulated")
     parser.add_argument("--precision", default="float32")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quiet", action="store_true")

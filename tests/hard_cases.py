@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from oracles import blend_by_loop, density_blend_by_loop, weights_by_loop
 
-from zestjax import cost_volume, depth, flow, frustum, metrics, numerics, planesweep, rays, rendering, resample, trust
+from zestjax import cost_volume, depth, flow, frustum, metrics, planesweep, rays, rendering, resample
+from zestjax.base import numerics
 from zestjax.cameras import Camera, project, unproject
 from zestjax.fields.conditioning import SourceViews, hidden, over_views, sample_views
+from zestjax.frames import trust
 from zestjax.losses import adversarial, means, photometric, priors, regularisers, scene_flow, supervision
 from zestjax.nets.layers import Norm, norm_act
 from zestjax.nets.positional import positional_encoding

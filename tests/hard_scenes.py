@@ -13,7 +13,7 @@ import stage
 
 
 class HardScene(NamedTuple):
-    """name. cause: what breaks a naive system. change: `(params, batch, config) -> (params, batch)`. tolerance: of
+    """name. cause: what breaks a naive system. change: `(params, batch, system) -> (params, batch)`. tolerance: of
     losses and of the gradient as a whole against float64's."""
 
     name: str
@@ -23,13 +23,13 @@ class HardScene(NamedTuple):
 
 
 def of_inputs(change):
-    return lambda params, batch, config: (params, batch._replace(inputs=change(batch.inputs)))
+    return lambda params, batch, system: (params, batch._replace(inputs=change(batch.inputs)))
 
 
 def of_truth(**changes):
     """Leaves of the truth set to one value."""
 
-    def change(params, batch, config):
+    def change(params, batch, system):
         filled = {name: np.full_like(getattr(batch.truth, name), value) for name, value in changes.items()}
         return params, batch._replace(truth=batch.truth._replace(**filled))
 
@@ -39,11 +39,11 @@ def of_truth(**changes):
 def of_params(part, **heads):
     """Biases of a field's heads: its density, blend or flow as extreme as they come."""
 
-    def change(params, batch, config):
+    def change(params, batch, system):
         field = getattr(params, part)
-        named = {n: getattr(field, n) for n in heads if getattr(field, n) is not None}
+        named = {n: getattr(field.net, n) for n in heads if getattr(field.net, n) is not None}
         pushed = {n: head._replace(bias=jnp.full_like(head.bias, heads[n])) for n, head in named.items()}
-        return params._replace(**{part: field._replace(**pushed)}), batch
+        return params._replace(**{part: field._replace(net=field.net._replace(**pushed))}), batch
 
     return change
 
@@ -51,11 +51,11 @@ def of_params(part, **heads):
 def at_time(time):
     """The target's time is another; slots beside it that the video does not have are not valid."""
 
-    def change(params, batch, config):
-        inputs, frames = stage.inputs_of(config, time=time)
+    def change(params, batch, system):
+        inputs, frames = stage.inputs_of(system, time=time)
         batch = batch._replace(inputs=inputs)
         if batch.evidence is not None:
-            whole = stage.prepared(config).evidence
+            whole = stage.prepared(system).evidence
             batch = batch._replace(evidence=jax.tree.map(lambda x: x[frames], whole))
         return params, batch
 
@@ -100,7 +100,7 @@ def bounds(near, far):
 LAST = stage.FRAMES - 1
 TURNED = np.diag([-1.0, 1, -1, 1]).astype(np.float32)
 SCENES = [
-    HardScene("as it is", "nothing", lambda params, batch, config: (params, batch)),
+    HardScene("as it is", "nothing", lambda params, batch, system: (params, batch)),
     HardScene("the first frame", "no neighbour before it", at_time(0)),
     HardScene("the last frame", "no neighbour after it", at_time(LAST)),
     HardScene("before the video", "no neighbour at all; normalised time below -1", at_time(-4)),
@@ -113,7 +113,7 @@ SCENES = [
     HardScene("sources beyond the scene", "some planes cut the sources' own", posed(
         lambda pose: pose + np.float32(-3) * np.eye(4, dtype=np.float32)[2][:, None] * np.eye(4, dtype=np.float32)[3])),
     HardScene("black", "constant images", painted(0.0)),
-    HardScene("white", "saturated images", painted(1.0)),
+    HardScene("white", "saturated images", painted(1.0), 1e-2),
     HardScene("grey", "no texture", painted(0.5)),
     HardScene("a target inside the scene", "points at the camera's centre", target_pose(z=3.9)),
     HardScene("a target that sees nothing", "empty rays", target_pose(x=1e3)),
@@ -132,5 +132,6 @@ SCENES = [
     HardScene("flow to the frustum's edge", "tanh saturates; z passes 1", of_params("dynamic", flow=50.0)),
     HardScene("flow to the camera", "z passes 0: points behind the camera", of_params("dynamic", flow=-50.0)),
     HardScene("no flow", "norms at 0: what is left of it is rounding", lambda p, b, c: (p._replace(
-        dynamic=p.dynamic._replace(flow=jax.tree.map(jnp.zeros_like, p.dynamic.flow))), b), 0.05),
+        dynamic=p.dynamic._replace(net=p.dynamic.net._replace(
+            flow=jax.tree.map(jnp.zeros_like, p.dynamic.net.flow)))), b), 0.05),
 ]  # fmt: skip

@@ -9,8 +9,8 @@ import numpy as np
 from oracles import of_experiments
 from scipy.ndimage import map_coordinates
 
-from zestjax import mvsnerf
 from zestjax.cameras import Camera
+from zestjax.systems import mvsnerf
 
 parity_arrays = of_experiments("parity_arrays")
 

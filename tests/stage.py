@@ -12,31 +12,76 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax import model
-from zestjax.analysis import frame_maps
-from zestjax.assembly import dequantised, target_inputs
-from zestjax.batches import PreparedClip, batch_from_clip, prepare_clip
 from zestjax.cameras import Camera
-from zestjax.learn import train_step
+from zestjax.frames.analysis import OwnMaps, frame_maps
+from zestjax.frames.assembly import dequantised
+from zestjax.frames.selection import KeyFrames, Slots
 from zestjax.losses.objective import PAPER_WEIGHTS
-from zestjax.prediction import render_rays
-from zestjax.presets import PRESETS, preset
+from zestjax.model import predict
 from zestjax.rays import pixel_grid
 from zestjax.simulate.clips import Clip
 from zestjax.solve import Adam
+from zestjax.systems import presets
+from zestjax.systems.fields import Dynamic, Static
+from zestjax.systems.sampling import Even
+from zestjax.systems.swept import Pyramid, Swept
+from zestjax.systems.system import Space, System
+from zestjax.systems.targets import target_inputs
+from zestjax.train.batches import PreparedClip, batch_from_clip, prepare_clip
+from zestjax.train.learn import SIMULATED_WEIGHTS, train_step, training_objective
+from zestjax.train.recipes import Pixels, Recipe, Rows
+from zestjax.train.terms import measurable
 from zestjax.video import Video
 
 SIZE = (16, 24)
 WALL, CARD, NEAR, FAR = 4.0, 2.0, 1.5, 6.0
 FRAMES = 6
 
-SMALLER = dict(planes=5, frame_widths=(4, 6), volume_widths=(4, 8), field_width=8, key_frames=3, slots=(-1, 0, 1))
-MINI = preset("tiny", height=16, width=24, evidence_planes=6, crop_rows=4, **SMALLER)
-STILL = dataclasses.replace(MINI, dynamic=False)
-PAPER = dataclasses.replace(
-    PRESETS["paper"], height=16, width=24, planes=4, features=8, volume_widths=(4, 8), key_frames=3, field_width=8,
-    field_depth=6, samples=4, point_levels=2, view_levels=1, crop_rows=4, mined_rays=8, ray_blocks=2,
+_MINI = dict(volume=Swept(widths=(4, 8)), width=8, depth=2)
+MINI = System(Space(5), Static(KeyFrames(3), **_MINI), Dynamic(Slots((-1, 0, 1)), **_MINI), frames=OwnMaps(6, (4, 6)))
+STILL = presets.still(MINI)
+_PAPER = dict(
+    volume=Swept(Pyramid(8), (4, 8), occupied=False), width=8, depth=6, point_levels=2, view_levels=1,
 )  # fmt: skip
+PAPER = dataclasses.replace(
+    presets.PAPER, space=Space(4, "depth", "key_frame", "strided"), sampler=Even(4),
+    static=dataclasses.replace(presets.PAPER.static, frames=KeyFrames(3, "spread"), **_PAPER),
+    dynamic=dataclasses.replace(presets.PAPER.dynamic, **_PAPER),
+)  # fmt: skip
+ROWS, PIXELS, BLOCKS = Rows(4), Pixels(4 * 24, 8), 2
+
+
+def recipe_of(system):
+    """How the stage teaches a system."""
+    rays = ROWS if system.space.cells == "pooled" else PIXELS
+    return Recipe(system, rays=rays, blocks=BLOCKS, height=16, width=24)
+
+
+def usual_weights(system):
+    """Those of the simulator's terms that a system can measure."""
+    return measurable(system, SIMULATED_WEIGHTS)
+
+
+@functools.cache
+def _objective(system, weights, blocks):
+    return training_objective(system, weights=dict(weights), blocks=blocks)
+
+
+def objective(system, weights=None, *, blocks=BLOCKS):
+    """`training_objective`, one function for the same choices."""
+    weights = usual_weights(system) if weights is None else weights
+    return _objective(system, tuple(weights.items()), blocks)
+
+
+def gradients(system, weights=None, *, blocks=BLOCKS):
+    """(params, batch) -> (gradient, terms, total)."""
+    taught = jax.value_and_grad(objective(system, weights, blocks=blocks), has_aux=True)
+
+    def both(params, batch):
+        (total, terms), grads = taught(params, batch)
+        return grads, terms, total
+
+    return both
 
 
 def painted(x, y):
@@ -99,10 +144,10 @@ def clip():
     )  # fmt: skip
 
 
-def params_of(config, seed=0):
-    """`ZestParams` drawn by numpy, which compiles nothing."""
+def params_of(system, seed=0):
+    """`Params` drawn by numpy, which compiles nothing."""
     rng = np.random.default_rng(seed)
-    shapes = jax.eval_shape(functools.partial(model.init_params, config=config), jax.random.key(0))
+    shapes = jax.eval_shape(system.init, jax.random.key(0))
 
     def draw(path, s):
         if s.ndim > 1:
@@ -114,56 +159,64 @@ def params_of(config, seed=0):
 
 
 @functools.cache
-def prepared(config=MINI):
+def prepared(system=MINI):
     """`PreparedClip` of the stage with frame 4 a hole."""
-    found = prepare_clip(jax.random.key(0), clip(), config)
+    found = prepare_clip(jax.random.key(0), clip(), system)
     assert len(found.holes) == 1
     return found
 
 
 @functools.cache
-def batch(config=MINI, kind=0):
+def batch(system=MINI, kind=0):
     """A `Batch` of the stage: of target `kind`, in the middle rows, where the card is."""
-    whole = prepared(config)
+    whole = prepared(system)
     shown = PreparedClip(whole.clip, whole.evidence, ())
     for seed in range(100):
-        found = batch_from_clip(jax.random.key(seed), shown, config)
+        found = batch_from_clip(jax.random.key(seed), shown, recipe_of(system))
         if found.inputs.time == whole.clip.target_time[kind] and found.truth.moving.any():
             return found
     raise AssertionError("no batch shows the card")
 
 
-def inputs_of(config=MINI, *, time=2, exclude=(), size=SIZE):
+def inputs_of(system=MINI, *, time=2, exclude=(), size=SIZE):
     """`Inputs` of a view from x = 0.1 at a time, and which frames they hold."""
     shown = video(size)
     return target_inputs(
-        shown.images, shown.cameras, NEAR, FAR, camera(0.1, size), time, config=config, exclude=exclude
+        shown.images, shown.cameras, NEAR, FAR, camera(0.1, size), time, system=system, exclude=exclude
     )
 
 
-def encoded(params, inputs, evidence, config):
-    """`model.Encoding` of inputs, from their frames' quantised evidence."""
-    maps = None if evidence is None else frame_maps(params.analysis, dequantised(evidence))
-    return model.encode(params, inputs, maps, config=config)
+def maps_of(params, evidence):
+    """`FrameMaps` of quantised evidence; None of None."""
+    return None if evidence is None else frame_maps(params.analysis, dequantised(evidence))
 
 
-def rays(params, inputs, evidence, pixels, *, config):
+def encoded(params, inputs, evidence, system):
+    """`Scene` of inputs, from their frames' quantised evidence."""
+    return system.encode(params, inputs, maps_of(params, evidence))
+
+
+def rays(params, inputs, evidence, pixels, *, system):
     """`Prediction` of pixels."""
-    return render_rays(params, encoded(params, inputs, evidence, config), inputs, pixels, config=config)
+    return predict(params, inputs, maps_of(params, evidence), pixels, system=system)
 
 
 @functools.cache
-def forward(config=MINI):
+def forward(system=MINI):
     """Compiled, kept: (params, inputs, evidence, pixels) -> `Prediction`."""
-    return jax.jit(functools.partial(rays, config=config))
+    return jax.jit(functools.partial(rays, system=system))
+
+
+def step(system=MINI, weights=None):
+    """Compiled, kept: a training step with Adam; `init`."""
+    weights = usual_weights(system) if weights is None else weights
+    return _step(system, tuple(weights.items()))
 
 
 @functools.cache
-def step(config=MINI, weights=None):
-    """Compiled, kept: a training step with Adam; `init`."""
+def _step(system, weights):
     solver = Adam(learning_rate=3e-3, clip_norm=1.0)
-    options = {} if weights is None else {"weights": weights}
-    return jax.jit(train_step(config, solver=solver, **options)), solver.init_state
+    return jax.jit(train_step(objective(system, dict(weights)), solver)), solver.init_state
 
 
 def paper_step():

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from oracles import assert_finite, assert_grads_match, normal
 
-from zestjax import analysis
-from zestjax.analysis import frame_maps, init_analysis, plane_moments
-from zestjax.evidence import FLOW_CHANNELS, Evidence
+from zestjax.frames import analysis
+from zestjax.frames.analysis import frame_maps, init_analysis, plane_moments
+from zestjax.frames.evidence import FLOW_CHANNELS, Evidence
 
 moments = jax.jit(plane_moments)
 
@@ -74,14 +74,14 @@ def evidence(seed=0, frames=3, planes=6):
 
 @pytest.fixture(scope="module")
 def analysed():
-    params = jax.jit(lambda key: init_analysis(key, planes=6, features=2, widths=(4, 6)))(jax.random.key(0))
+    params = jax.jit(lambda key: init_analysis(key, planes=6, widths=(4, 6)))(jax.random.key(0))
     total = lambda p, e: sum(jnp.sum(x) for x in frame_maps(p, e))
     return params, jax.jit(lambda e: (frame_maps(params, e), jax.grad(total, argnums=(0, 1))(params, e)))
 
 
 def test_maps_have_their_shapes_and_ranges(analysed):
     maps, _ = analysed[1](evidence())
-    assert maps.features.shape == (3, 4, 6, 2) and maps.logits.shape == (3, 4, 6, 6)
+    assert maps.logits.shape == (3, 4, 6, 6)
     assert maps.moving_logits.shape == (3, 8, 12)
     assert (maps.coordinate >= 0).all() and (maps.coordinate <= 1).all() and (maps.tolerance > 0).all()
 

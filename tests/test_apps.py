@@ -12,6 +12,7 @@ import stage
 from zestjax.apps import paths, scoring, stereo, tables, train
 from zestjax.apps.host import host_camera, host_video
 from zestjax.cameras import Camera, project, rigid_inverse, unproject
+from zestjax.frames.known import known_frames
 
 
 def test_the_stereo_pair_agrees_with_its_calibration():
@@ -159,15 +160,15 @@ def test_a_bad_path_says_what_it_should_be(tmp_path, video):
 
 def test_scenes_are_learned_from_in_turn_each_from_its_own_frames():
     dark = stage.video()._replace(images=0.5 * stage.video().images)
-    shown = {"light": stage.video(), "dark": dark}
+    shown = {"light": known_frames(stage.video()), "dark": known_frames(dark)}
     options = train.TrainOptions(Path("unused"), scenes=("light", "dark"))
-    with train.batches(stage.MINI, options, tuple(shown.values())) as batch_at:
+    with train.batches(stage.recipe_of(stage.MINI), options, tuple(shown.values())) as batch_at:
         found = [batch_at(step) for step in range(4)]
     brightest = [float(np.max(batch.inputs.key.images)) for batch in found]
     assert max(brightest[1::2]) <= 0.5 < min(brightest[::2])
     for batch in found:
         assert int(batch.inputs.time) not in batch.inputs.key.times[batch.inputs.key.valid > 0]
-        assert not batch.truth.known.any()
+        assert batch.truth.depth is None and batch.truth.flow is None
 
 
 @pytest.mark.parametrize("change, words", [

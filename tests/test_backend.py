@@ -13,10 +13,10 @@ import stage
 from oracles import normal
 
 import zestjax
-from zestjax import backend
 from zestjax.apps import doctor
+from zestjax.apps.cli import main
+from zestjax.base import backend
 from zestjax.cameras import Camera, project, unproject
-from zestjax.cli import main
 from zestjax.testing import backend_checks, check_backend
 from zestjax.testing.backend import Check, batched_gradient_error
 
@@ -66,7 +66,7 @@ jnp.zeros(3)
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     import zestjax
-from zestjax.backend import sum_error
+from zestjax.base.backend import sum_error
 mapped = jax.jit(jax.vmap(lambda x: jnp.sum((jnp.eye(3) @ x) ** 2))).lower(jnp.zeros((40000, 3))).compile().as_text()
 print(json.dumps([zestjax.BACKEND.state, len(caught), sum_error(), "FUSED" in mapped]))
 """.replace("FUSED", FUSED)

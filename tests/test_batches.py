@@ -1,29 +1,28 @@
 """One target of a clip, with everything that is known about it."""
 
-import dataclasses
-import functools
-
 import jax
 import numpy as np
 import pytest
 import stage
 from stage import MINI, PAPER
 
-from zestjax import batches
-from zestjax.assembly import footage, video_evidence
-from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
-from zestjax.evidence import Evidence
-from zestjax.learn import train_step
+from zestjax.frames.assembly import footage, video_evidence
+from zestjax.frames.evidence import Evidence
+from zestjax.train import batches
+from zestjax.train.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
+from zestjax.train.recipes import Pixels, Rows
+
+RECIPE = stage.recipe_of(MINI)
 
 
 @pytest.fixture(scope="module")
 def drawn():
     """Twenty batches of the stage."""
-    return [batch_from_clip(jax.random.key(i), stage.prepared(), MINI) for i in range(20)]
+    return [batch_from_clip(jax.random.key(i), stage.prepared(), RECIPE) for i in range(20)]
 
 
 def test_a_batch_is_a_function_of_its_key(drawn):
-    again = batch_from_clip(jax.random.key(0), stage.prepared(), MINI)
+    again = batch_from_clip(jax.random.key(0), stage.prepared(), RECIPE)
     jax.tree.map(np.testing.assert_array_equal, again, drawn[0])
     assert len({float(b.truth.pixels[0, 1]) for b in drawn}) > 3
     assert {float(b.inputs.time) for b in drawn} == {2.0, 3.0, float(stage.prepared().holes[0])}
@@ -49,11 +48,12 @@ def test_the_crop_shows_whole_rows_of_the_target(drawn):
 
 def test_uniform_rays_are_spread_over_the_image_and_mined_where_it_moves():
     truth = stage.batch(PAPER).truth
-    count = PAPER.crop_rows * 24
-    assert len(truth.pixels) == count + PAPER.mined_rays
+    count = stage.PIXELS.count
+    assert len(truth.pixels) == count + stage.PIXELS.mined
     assert len(np.unique(truth.pixels[:count], axis=0)) == count and np.ptp(truth.pixels[:count, 1]) > 10
     assert (truth.moving[count:] == 1).all()
     image = stage.shot(0.1, 2)[0]
+    assert truth.jitter.shape == (len(truth.pixels), PAPER.sampler.samples) and 0.4 < truth.jitter.mean() < 0.6
     u, v = truth.pixels.astype(int).T
     np.testing.assert_allclose(truth.colour, image[v, u], atol=0.5 / 255 + 1e-6)
 
@@ -92,11 +92,11 @@ def planes_by_hand(depth, count, spacing):
 
 def test_depths_are_planes_of_the_volumes_and_of_the_frames():
     found = stage.batch()
-    np.testing.assert_allclose(found.static_planes, planes_by_hand(stage.WALL, MINI.planes, "inverse"), rtol=1e-5)
-    wall, card = (planes_by_hand(z, MINI.evidence_planes, "inverse") for z in (stage.WALL, stage.CARD))
+    np.testing.assert_allclose(found.static_planes, planes_by_hand(stage.WALL, MINI.space.planes, "inverse"), rtol=1e-5)
+    wall, card = (planes_by_hand(z, MINI.frames.planes, "inverse") for z in (stage.WALL, stage.CARD))
     assert set(np.round(found.frame_planes, 3).ravel()) == set(np.round(np.float32([wall, card]), 3))
     paper = stage.batch(PAPER)
-    np.testing.assert_allclose(paper.static_planes, planes_by_hand(stage.WALL, PAPER.planes, "depth"), rtol=1e-5)
+    np.testing.assert_allclose(paper.static_planes, planes_by_hand(stage.WALL, PAPER.space.planes, "depth"), rtol=1e-5)
     assert paper.evidence is None
 
 
@@ -114,7 +114,7 @@ def test_hidden_frames_are_neither_inputs_nor_targets():
     whole = stage.prepared()
     hidden = PreparedClip(whole.clip, whole.evidence, whole.holes, (0, 1))
     for seed in range(8):
-        inputs = batch_from_clip(jax.random.key(seed), hidden, MINI).inputs
+        inputs = batch_from_clip(jax.random.key(seed), hidden, RECIPE).inputs
         assert not {0, 1} & set(inputs.key.times[inputs.key.valid > 0])
         assert not np.asarray(inputs.slots.valid)[np.isin(inputs.slots.times, [0, 1])].any()
 
@@ -146,9 +146,22 @@ def test_a_stored_clip_that_lacks_a_field_is_refused():
 
 
 def test_a_crop_that_cannot_be_shared_among_the_blocks_is_refused():
-    step = train_step(dataclasses.replace(MINI, ray_blocks=5), solver=None)
-    with pytest.raises(ValueError, match="96 rays has no 5 equal blocks"):
-        jax.eval_shape(functools.partial(step, stage.params_of(MINI), None), stage.batch())
+    with pytest.raises(ValueError, match="96 rays have no 5 equal blocks"):
+        jax.eval_shape(stage.objective(MINI, blocks=5), stage.params_of(MINI), stage.batch())
+
+
+def test_rays_that_a_target_does_not_have_are_refused():
+    moving, rng = np.zeros((4, 6), bool), np.random.default_rng(0)
+    with pytest.raises(ValueError, match="Rows: `count` is 5, the target has 4 rows"):
+        Rows(5).draw(rng, moving, 0)
+    with pytest.raises(ValueError, match="Pixels: `count` is 25, the target has 24 pixels"):
+        Pixels(25, 0).draw(rng, moving, 0)
+
+
+def test_rays_are_mined_while_the_priors_are_on():
+    moving, rays = np.eye(6, dtype=bool), Pixels(12, 4, 10)
+    sizes = [len(rays.draw(np.random.default_rng(0), moving, step)) for step in (0, 9, 10, 99)]
+    assert sizes == [16, 16, 12, 12]
 
 
 def test_a_batch_of_frames_holds_each_frame_with_its_own_truth():
@@ -158,8 +171,8 @@ def test_a_batch_of_frames_holds_each_frame_with_its_own_truth():
     for i, evidence in enumerate(found.evidence.colours):
         frame = next(k for k in range(stage.FRAMES) if np.array_equal(whole.evidence.colours[k], evidence))
         depth = batches._cells(whole.clip.depth[frame])
-        np.testing.assert_allclose(found.frame_planes[i], planes_by_hand(depth, MINI.evidence_planes, "inverse"), 1e-4)
+        np.testing.assert_allclose(found.frame_planes[i], planes_by_hand(depth, MINI.frames.planes, "inverse"), 1e-4)
         np.testing.assert_array_equal(found.frame_moving[i].sum(), whole.clip.moving[frame].mean() * 8 * 12)
     assert (found.frame_valid == 1).all()
-    with pytest.raises(ValueError, match="encoder `pyramid` asks nothing of single frames"):
+    with pytest.raises(ValueError, match="the system asks nothing of single frames"):
         frame_batch(jax.random.key(0), [stage.prepared(PAPER)], PAPER)

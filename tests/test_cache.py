@@ -11,7 +11,7 @@ import pytest
 from zestjax.apps import cache, train
 from zestjax.apps.clips import ClipSpec, clip_folder, clip_path, evidence_folder, write_clip
 from zestjax.apps.train import TrainOptions
-from zestjax.presets import preset
+from zestjax.train.recipes import TINY
 
 NAME = "144x256-16+8-seed{}-0123abcd"
 HOLDER = """
@@ -89,10 +89,10 @@ def test_a_run_that_begins_or_ends_keeps_its_clips_for_as_long_again(clips):
 
 @pytest.mark.parametrize("quiet", [False, True])
 def test_a_training_says_which_clips_it_removed_and_leaves_given_ones(clips, tmp_path, capsys, quiet):
-    stale, config = filled(clips / NAME.format(1), days=31), preset("tiny")
-    with train.batches(config, TrainOptions(tmp_path / "out", clips=tmp_path / "kept", quiet=quiet)):
+    stale = filled(clips / NAME.format(1), days=31)
+    with train.batches(TINY, TrainOptions(tmp_path / "out", clips=tmp_path / "kept", quiet=quiet)):
         assert stale.exists() and not list(tmp_path.glob("kept/*/.lock"))
-    with train.batches(config, TrainOptions(tmp_path / "out", quiet=quiet)):
+    with train.batches(TINY, TrainOptions(tmp_path / "out", quiet=quiet)):
         assert not stale.exists()
         (own,) = clips.iterdir()
         assert (own / cache.LOCK).exists()

@@ -15,18 +15,19 @@ import pytest
 
 from zestjax import novel_view
 from zestjax.apps import cache, frontier, tables
+from zestjax.apps.cli import main
 from zestjax.apps.host import host_camera, host_video
 from zestjax.apps.producer import ProducerError
 from zestjax.apps.train import TrainOptions, fresh
-from zestjax.apps.weights import arithmetic, open_weights, system_of
-from zestjax.cli import main
+from zestjax.apps.weights import ablated_name, arithmetic, open_weights
+from zestjax.base.parts import to_stored
 from zestjax.io.nsff import write_nsff
 from zestjax.io.scenes import Target
 from zestjax.io.video import read_video
 from zestjax.io.weights import save_weights
-from zestjax.model import init_params
 from zestjax.novel_view import View
-from zestjax.presets import preset
+from zestjax.systems.presets import ABLATED
+from zestjax.train.recipes import RECIPES, TINY
 
 FRAMES, HEIGHT, WIDTH = 6, 32, 48
 
@@ -56,32 +57,36 @@ def places(tmp_path_factory):
         for t, c in ((1, 0), (4, 2))
     ]
     write_nsff(root / "scene", "toy", video, held_out=held_out)
-    for name, changes in (("tiny", {}), ("geometry", {"motion": False})):
-        config = preset("tiny", **changes)
-        shapes = jax.eval_shape(lambda config=config: init_params(jax.random.key(0), config))
-        zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
-        save_weights(root / f"{name}.safetensors", zeros, metadata={"config": dataclasses.asdict(config), "seed": 0})
+    for name, system in (("tiny", "zest"), ("geometry", "zest-geometry")):
+        save_zeros(root / f"{name}.safetensors", TINY.of(ABLATED[system](TINY.system)))
     return root
+
+
+def save_zeros(path, recipe):
+    """Weights of a recipe that know nothing."""
+    shapes = jax.eval_shape(recipe.system.init, jax.random.key(0))
+    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    save_weights(path, zeros, metadata={"recipe": to_stored(recipe), "preset": "tiny", "seed": 0})
 
 
 @pytest.fixture(autouse=True)
 def no_cache(monkeypatch):
     """The user's cache folder is not the tests' to fill."""
-    monkeypatch.setattr("zestjax.cli._prepare_jax", lambda: None)
+    monkeypatch.setattr("zestjax.apps.cli._prepare_jax", lambda: None)
 
 
 @pytest.fixture
 def grey(monkeypatch):
     """A model that shows grey, so that nothing has to be compiled."""
 
-    def render_view(params, prepared, camera, time, *, config, exclude=()):
+    def render_view(params, prepared, camera, time, *, system, exclude=()):
         size = prepared.images.shape[1:3]
         maps = np.full(size, 0.5, np.float32)
         colour = np.full((*size, 3), 0.5, np.float32)
         leaves: Any = (colour, colour, None, 4 * maps, maps, maps, np.zeros((*size, 2), np.float32))
         return View(*leaves)
 
-    monkeypatch.setattr(novel_view, "prepare", lambda params, video, *, config: video)
+    monkeypatch.setattr(novel_view, "prepare", lambda params, video, *, system: video)
     monkeypatch.setattr(novel_view, "render_view", render_view)
 
 
@@ -133,10 +138,7 @@ def test_evaluate_says_once_what_a_scene_lacks_and_what_is_null_for_it(places, g
 
 
 def test_pictures_are_enlarged_with_a_word_unless_a_size_is_asked_for(places, grey, capsys):
-    config = preset("tiny", height=64, width=96)
-    shapes = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
-    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
-    save_weights(places / "tall.safetensors", zeros, metadata={"config": dataclasses.asdict(config), "seed": 0})
+    save_zeros(places / "tall.safetensors", dataclasses.replace(TINY, height=64, width=96))
     flags = ("--path", "frames", "--frames", "2", "--out", str(places / "out/tall"))
     warned = lambda: [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
     with warnings.catch_warnings():
@@ -191,7 +193,7 @@ def test_frontier_writes_every_setting_and_marks_what_no_other_beats(places, gre
     assert capsys.readouterr().out.startswith("frontier: on toy")
     lines = (places / "out/frontier/frontier.csv").read_text().splitlines()
     assert lines[0] == "setting,psnr_full,psnr_dynamic,ssim_full,seconds_per_frame,peak_mb,pareto"
-    assert len(lines) == 1 + len(frontier.settings_of(preset("tiny")))
+    assert len(lines) == 1 + len(frontier.settings_of(TINY.system))
     assert (places / "out/frontier/frontier.png").is_file()
 
 
@@ -201,9 +203,10 @@ def test_the_pareto_set_holds_what_is_fastest_what_is_best_and_no_loser():
 
 
 def test_weights_tell_their_system(places):
-    assert open_weights(places / "tiny.safetensors").system == "zest"
-    assert open_weights(places / "geometry.safetensors", system="zest-geometry").system == "zest-geometry"
-    assert system_of(preset("tiny", geometry=False, motion=False)) == "zest-none"
+    assert open_weights(places / "tiny.safetensors").name == "zest"
+    assert open_weights(places / "geometry.safetensors", system="zest-geometry").name == "zest-geometry"
+    for preset in RECIPES.values():
+        assert [ablated_name(change(preset.system)) for change in ABLATED.values()] == list(ABLATED)
 
 
 def refused(capsys, code, *words):
@@ -381,7 +384,7 @@ def test_weights_are_float32_whatever_jax_was_started_with(places, started):
         with arithmetic("float64"):
             assert jnp.result_type(float) == jnp.float64
         with arithmetic():
-            state, _ = fresh(preset("tiny"), TrainOptions(places / "unused", preset="tiny"))
+            state, _ = fresh(TINY, TrainOptions(places / "unused", preset="tiny"))
     for tree in (model.params, state.params):
         assert {leaf.dtype for leaf in jax.tree.leaves(tree)} == {jnp.dtype("float32")}
 

@@ -11,7 +11,7 @@ from oracles import assert_finite
 
 from zestjax import cameras, cost_volume, planesweep
 from zestjax.cameras import Camera
-from zestjax.trust import Trust
+from zestjax.frames.trust import Trust
 
 V, D, H, W, C = 3, 4, 7, 8, 4
 K = np.array([[10.0, 0, 3.5], [0, 9, 3.0], [0, 0, 1]], "f")

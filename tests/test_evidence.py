@@ -9,11 +9,12 @@ import pytest
 import stage
 from oracles import assert_grads_match, normal, uniform, value_and_gradients
 
-from zestjax import evidence, optical_flow
-from zestjax.evidence import FLOW_RANGE, GAP, TRUNCATION, Neighbours, Sources
+from zestjax.frames import cells as cells_module
+from zestjax.frames import evidence, optical_flow
+from zestjax.frames.evidence import FLOW_RANGE, GAP, TRUNCATION, Neighbours, Sources
 from zestjax.planesweep import plane_depths
 
-pooled = jax.jit(evidence.pooled, static_argnums=1)
+pooled = jax.jit(cells_module.pooled, static_argnums=1)
 static_costs, flow_gaps = jax.jit(evidence.static_costs), jax.jit(evidence.flow_gaps)
 
 
@@ -47,14 +48,14 @@ def test_pooling_is_the_mean_of_blocks_with_the_edge_repeated(size):
 
 @pytest.mark.parametrize("size", [(16, 24), (13, 18), (5, 9), (1, 2)])
 def test_half_images_hold_whole_cells(size):
-    half = evidence.half_images(uniform(0, 2, *size, 3))
+    half = cells_module.half_images(uniform(0, 2, *size, 3))
     assert half.shape == (2, 2 * -(-size[0] // 4), 2 * -(-size[1] // 4), 3)
-    assert evidence.cell_values(half).shape == (2, half.shape[1] // 2, half.shape[2] // 2, 12)
+    assert cells_module.cell_values(half).shape == (2, half.shape[1] // 2, half.shape[2] // 2, 12)
 
 
 def test_a_cell_holds_its_four_pixels_row_by_row():
     half = uniform(1, 4, 6, 3)
-    found = evidence.cell_values(half)
+    found = cells_module.cell_values(half)
     np.testing.assert_array_equal(found[1, 2].reshape(2, 2, 3), half[2:4, 4:6])
 
 
@@ -188,7 +189,7 @@ def test_costs_match_finite_differences(x64):
 def found():
     """Evidence of the stage's frame 2 from the others."""
     video = stage.video((32, 48))
-    half = evidence.half_images(jnp.asarray(video.images))
+    half = cells_module.half_images(jnp.asarray(video.images))
     flow = optical_flow.video_flow(video.images)
     taken = lambda frames: jax.tree.map(lambda x: x[np.array(frames)], video.cameras)
     find = jax.jit(functools.partial(evidence.frame_evidence, planes=9))

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from oracles import assert_grads_match, normal, uniform, value_and_gradients
 
-from zestjax import trust
 from zestjax.cameras import Camera, unproject
 from zestjax.fields import conditioning, dynamic, static
+from zestjax.fields import heads as heads_module
 from zestjax.fields.conditioning import SourceViews, ViewSamples
+from zestjax.fields.heads import Blend, Direct
 from zestjax.fields.trunk import blend_of_views, init_trunk, lifted, pooled_views, trunk, view_scores
+from zestjax.frames import trust
 
 V, P, WIDTH, CHANNELS = 3, 5, 6, 4
 
@@ -146,25 +148,35 @@ def test_the_trunk_is_that_of_a_loop(how, depth):
     params = init_trunk(jax.random.key(0), 3, 4, width=WIDTH, depth=depth)
     assert len(params.layers) == depth and (depth < 6 or params.layers[5].kernel.shape[0] == WIDTH + 3)
     x, condition = normal(0, P, 3), normal(1, P, 4)
-    found = jax.jit(trunk, static_argnames="conditioning")(params, x, condition, conditioning=how)
+    found = jax.jit(trunk, static_argnames="modulation")(params, x, condition, modulation=how)
     np.testing.assert_allclose(found, trunk_by_loop(params, x, condition, how), rtol=1e-4, atol=1e-5)
 
 
-def test_an_unknown_conditioning_is_refused():
-    with pytest.raises(ValueError, match="conditioning"):
-        trunk(None, None, None, conditioning="subtract")
+def test_an_unknown_modulation_is_refused():
+    with pytest.raises(ValueError, match="modulation"):
+        trunk(None, None, None, modulation="subtract")
 
 
 @functools.cache
 def fields():
     """Parameters of both fields with a blend head, and of a static one with a direct head."""
-    sizes = dict(n_point=3, n_direction=3, n_volume=CHANNELS, width=WIDTH, depth=2)
+
+    def sizes(head, features, summaries):
+        init = lambda key: head.init(key, features=features, width=WIDTH, directions=3)
+        reads = head.channels(volume=CHANNELS, views=V, summaries=summaries)
+        return dict(n_point=3, n_condition=reads, width=WIDTH, depth=2, head=init)
+
+    still = lambda head: sizes(head, static.VIEW_FEATURES, static.SUMMARIES)
+    moving = sizes(BLEND, dynamic.VIEW_FEATURES, dynamic.SUMMARIES + 2 * V)
     make = lambda key: (
-        static.init_static(key, n_views=None, head="blend", **sizes),
-        dynamic.init_dynamic(key, n_views=None, slots=V, head="blend", **sizes),
-        static.init_static(key, n_views=4 * V, head="direct", **sizes),
+        static.init_static(key, **still(BLEND)),
+        dynamic.init_dynamic(key, n_volume=CHANNELS, looks=True, **moving),
+        static.init_static(key, **still(DIRECT)),
     )
     return jax.jit(make)(jax.random.key(0))
+
+
+BLEND, DIRECT = Blend(), Direct()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -175,14 +187,14 @@ def drawn():
 
 
 def heads(features, weights, hidden, colour, visible):
-    head = jax.tree.map(lambda x: x.astype(features.dtype), fields()[0].views)
+    head = jax.tree.map(lambda x: x.astype(features.dtype), fields()[0].head.views)
     lift = lifted(head, features)
     scores = view_scores(head, lift, hidden)
     return pooled_views(lift, weights), scores, blend_of_views(scores, weights, visible, colour)
 
 
 def heads_by_loop(features, weights, hidden, colour, visible):
-    head = jax.tree.map(lambda x: np.asarray(x, np.float64), fields()[0].views)
+    head = jax.tree.map(lambda x: np.asarray(x, np.float64), fields()[0].head.views)
     features, weights, hidden, colour = (np.asarray(x, np.float64) for x in (features, weights, hidden, colour))
     pooled, scores, blended = [], np.zeros((V, P)), []
     for p in range(P):
@@ -248,12 +260,12 @@ def both(colour, visible, moving, gap, volume):
     point, direction = uniform(5, P, 3, dtype=dtype), uniform(6, P, 3, dtype=dtype)
     shift, times = uniform(7, V, P, dtype=dtype), jnp.arange(V, dtype=dtype) - 1
     early = dynamic.early_flow(moved, point, volume, reach=0.15)
+    of_still = BLEND(still.head, volume, samples, static.static_views(samples, shift, times))
+    of_moved = BLEND(moved.head, volume, samples, dynamic.dynamic_views(samples, times))
     return (
-        static.static_field(still, point, direction, volume, samples, static.static_views(samples, shift, times)),
-        dynamic.dynamic_field(
-            moved, point, direction, volume, samples, dynamic.dynamic_views(samples, times), reach=0.15, early=early
-        ),
-        static.static_field(direct, point, direction, volume, samples, None),
+        static.static_field(still, point, direction, of_still),
+        dynamic.dynamic_field(moved, point, direction, of_moved, reach=0.15, early=early),
+        static.static_field(direct, point, direction, DIRECT(direct.head, volume, samples, None)),
     )
 
 
@@ -299,7 +311,8 @@ def test_a_view_that_sees_nothing_changes_no_field():
 
 def without_residual(params):
     """The field with a colour head that says nothing: only the views' colours are left."""
-    return params._replace(colour=jax.tree.map(jnp.zeros_like, params.colour))
+    silent = jax.tree.map(jnp.zeros_like, params.head.colour)
+    return params._replace(head=params.head._replace(colour=silent))
 
 
 def coloured():
@@ -315,9 +328,9 @@ def shown_by(field, moving, gap):
     params = without_residual(fields()[field])
     if field == 0:
         views = static.static_views(samples, jnp.zeros((V, P)), times)
-        return static.static_field(params, point, point, volume, samples, views).colour
+        return static.static_field(params, point, point, BLEND(params.head, volume, samples, views)).colour
     views = dynamic.dynamic_views(samples, times)
-    return dynamic.dynamic_field(params, point, point, volume, samples, views).colour
+    return dynamic.dynamic_field(params, point, point, BLEND(params.head, volume, samples, views)).colour
 
 
 def test_a_point_hidden_behind_a_frames_own_surface_does_not_take_its_colour():
@@ -337,10 +350,10 @@ def test_the_dynamic_field_takes_the_colour_of_what_moves_where_the_point_is():
 
 
 def test_without_views_or_volume_a_field_is_conditioned_on_a_constant():
-    np.testing.assert_array_equal(static.concatenated(jnp.zeros((P, 0)), None), np.ones((P, 1)))
+    np.testing.assert_array_equal(heads_module.concatenated(jnp.zeros((P, 0)), None), np.ones((P, 1)))
     volume = uniform(0, P, 2)
-    np.testing.assert_array_equal(static.concatenated(volume, None), volume)
+    np.testing.assert_array_equal(heads_module.concatenated(volume, None), volume)
     colour, visible, moving, gap, _ = seen()
-    rows = static.concatenated(volume, ViewSamples(colour, visible, moving, gap))
+    rows = heads_module.concatenated(volume, ViewSamples(colour, visible, moving, gap))
     np.testing.assert_array_equal(rows[3, 2:6], [*colour[0, :, 3], 1])
     np.testing.assert_array_equal(rows[3, 10:14], [*colour[2, :, 3], 1])

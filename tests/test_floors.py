@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zestjax import floors, metrics
+from zestjax import metrics
 from zestjax.cameras import Camera, look_at, project, unproject
+from zestjax.judge import floors
 from zestjax.rays import pixel_grid
 from zestjax.video import Video
 

@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from zestjax import cost_volume, depth, flow, frustum, metrics, numerics, planesweep, rays, rendering, resample, trust
+from zestjax import cost_volume, depth, flow, frustum, metrics, planesweep, rays, rendering, resample
+from zestjax.base import numerics
 from zestjax.cameras import Camera, look_at, project, unproject
 from zestjax.fields import conditioning
+from zestjax.frames import trust
 from zestjax.losses import adversarial, photometric, priors, regularisers, scene_flow, supervision
 from zestjax.nets.layers import Conv, Dense, Norm, conv2d, dense, norm_act
 from zestjax.nets.positional import positional_encoding

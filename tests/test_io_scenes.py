@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from zestjax.cameras import Camera, look_at, project
-from zestjax.inputs import check_inputs, check_target
+from zestjax.frames.inputs import check_inputs, check_target
 from zestjax.io.layouts import bounds_from_frames, select
 from zestjax.io.nsff import write_nsff
 from zestjax.io.pictures import write_image

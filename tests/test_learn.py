@@ -1,6 +1,5 @@
 """A training step: its gradient, its terms, what it leaves out, and that it learns."""
 
-import dataclasses
 import functools
 
 import jax
@@ -11,23 +10,17 @@ import stage
 from oracles import adam_by_loop, normal
 from stage import MINI, PAPER, STILL
 
-from zestjax import learn
-from zestjax.analysis import FrameMaps
-from zestjax.batches import frame_batch
 from zestjax.encoding import Volume
-from zestjax.learn import (
-    FRAME_WEIGHTS,
-    MOVER_SHARE,
-    Fault,
-    find_fault,
-    frames_only,
-    make_train_step,
-    scene_terms,
-    stage_weights,
-    train_step,
-)
-from zestjax.losses.objective import PAPER_WEIGHTS, Terms, measured, weighted_sum
-from zestjax.measures import RAY_TERMS, SCENE_TERMS, make_measures, measurable
+from zestjax.frames.analysis import FrameMaps
+from zestjax.losses.objective import PAPER_WEIGHTS, measured, weighted_sum
+from zestjax.solve import Adam
+from zestjax.systems import presets
+from zestjax.train.batches import frame_batch
+from zestjax.train.blocks import in_blocks
+from zestjax.train.learn import SIMULATED_WEIGHTS, Fault, find_fault, stage_weights, train_step
+from zestjax.train.measures import RAYS, make_measures
+from zestjax.train.recipes import Cosine, Recipe
+from zestjax.train.terms import MOVER_SHARE, scene_terms, weights_of
 
 
 class Caught:
@@ -38,22 +31,22 @@ class Caught:
         return grads, value
 
 
-def plain_objective(config, weights):
+def plain_objective(system, weights, blocks=stage.BLOCKS):
     """The mean over the blocks of rays of the whole objective, written without blocks or held tables."""
 
     def total(params, batch):
         whole = jnp.zeros(())
-        for block in range(config.ray_blocks):
-            truth = jax.tree.map(lambda x, b=block: jnp.split(jnp.asarray(x), config.ray_blocks)[b], batch.truth)
-            maps = stage.frame_maps(params.analysis, stage.dequantised(batch.evidence))
-            encoding = stage.model.encode(params, batch.inputs, maps, config=config)
-            prediction = stage.render_rays(params, encoding, batch.inputs, truth.pixels, config=config)
-            measures = make_measures(params, encoding, batch.inputs, config=config)
-            chosen = lambda names: Terms(**{n: getattr(weights, n) for n in names})
-            terms = measured(measures, prediction, truth, chosen(RAY_TERMS))
-            scene = scene_terms(maps, (encoding.geometry, encoding.motion), batch, weights)
-            whole += weighted_sum(terms, chosen(RAY_TERMS)) + weighted_sum(scene, chosen(SCENE_TERMS))
-        return whole / config.ray_blocks
+        for block in range(blocks):
+            truth = jax.tree.map(lambda x, b=block: jnp.split(jnp.asarray(x), blocks)[b], batch.truth)
+            maps = stage.maps_of(params, batch.evidence)
+            scene = system.encode(params, batch.inputs, maps)
+            prediction = system.render(params, scene, batch.inputs, truth.pixels, jitter=truth.jitter)
+            of_rays = weights_of(RAYS, weights)
+            terms = measured(make_measures(system, params, scene, batch.inputs), prediction, truth, of_rays)
+            volumes = tuple(seen.volume for seen in (scene.static, scene.dynamic))
+            known = scene_terms(maps, volumes, batch, weights)
+            whole += weighted_sum(terms, of_rays) + weighted_sum(known, weights_of(known, weights))
+        return whole / blocks
 
     return total
 
@@ -62,17 +55,74 @@ def assert_all_finite(tree):
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(tree))
 
 
+def assert_same_gradient(ours, theirs):
+    largest = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(theirs))
+    assert largest > 0
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-3, atol=1e-5 * largest)
+
+
 def test_the_blocked_gradient_is_the_plain_gradient_of_the_same_objective():
     params, batch = stage.params_of(MINI), stage.batch()
-    grads, value, terms = jax.jit(train_step(MINI, solver=Caught))(params, None, batch)
-    plain = jax.jit(jax.value_and_grad(plain_objective(MINI, FRAME_WEIGHTS)))
+    grads, terms, value = jax.jit(stage.gradients(MINI))(params, batch)
+    plain = jax.jit(jax.value_and_grad(plain_objective(MINI, SIMULATED_WEIGHTS)))
     expected_value, expected = plain(params, batch)
     np.testing.assert_allclose(value, expected_value, rtol=1e-5)
-    np.testing.assert_allclose(terms["total"], expected_value, rtol=1e-5)
-    largest = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(expected))
-    assert largest > 0
-    for ours, theirs in zip(jax.tree.leaves(grads), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=1e-5 * largest)
+    np.testing.assert_allclose(weighted_sum(terms, SIMULATED_WEIGHTS), expected_value, rtol=1e-5)
+    assert_same_gradient(grads, expected)
+
+
+def test_the_objective_has_a_gradient_in_its_weights():
+    params, batch, weights = stage.params_of(STILL), stage.batch(STILL), dict(rec=2.0, frame_ce=0.5)
+    taught = stage.objective(STILL, weights)
+    slopes, terms = jax.jit(jax.grad(taught, argnums=2, has_aux=True))(params, batch, weights)
+    for name in weights:
+        np.testing.assert_allclose(slopes[name], terms[name], rtol=1e-5)
+    doubled = jax.jit(taught)(params, batch, jax.tree.map(lambda w: 2 * w, weights))[0]
+    np.testing.assert_allclose(doubled, 2 * jax.jit(taught)(params, batch)[0], rtol=1e-5)
+
+
+def test_jaxopts_interface_takes_the_objective_that_trains():
+    """`Adam.update` on the objective is the training step."""
+    params, batch, objective = stage.params_of(MINI), stage.batch(), stage.objective(MINI)
+    options = dict(learning_rate=3e-3, clip_norm=1.0, eps=1e-3)  # not the sign of what is rounding
+    solver, plain = Adam(fun=objective, has_aux=True, **options), Adam(**options)
+    ours, theirs = jax.jit(train_step(objective, plain)), jax.jit(solver.update)
+    mine, kept, its, state = params, plain.init_state(params), params, solver.init_state(params, batch)
+    for _ in range(2):
+        mine, kept, _ = ours(mine, kept, batch)
+        its, state = theirs(its, state, batch)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), mine, its)
+
+
+def quadratic(shared, held, block):
+    """(value, aux) of a loss that is written down."""
+    residual = held * (block @ shared) - 1
+    return jnp.mean(residual**2), {"mean": jnp.mean(residual)}
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_blocks_are_a_way_to_compute_and_no_other_function(count):
+    shared, held, data = normal(0, 3), jnp.float32(0.7), normal(1, 8, 3)
+    blocked = jax.value_and_grad(in_blocks(quadratic, count), has_aux=True)
+    (value, aux), grad = jax.jit(blocked)(shared, held, data)
+    (expected, told), slope = jax.value_and_grad(quadratic, has_aux=True)(shared, held, data)
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+    np.testing.assert_allclose(grad, slope, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(aux["mean"], told["mean"], atol=1e-6)
+    scaled = jax.grad(lambda s: 3 * in_blocks(quadratic, count)(s, held, data)[0])(shared)
+    np.testing.assert_allclose(scaled, 3 * slope, rtol=1e-4, atol=1e-6)
+    mapped = jax.vmap(jax.grad(lambda s: in_blocks(quadratic, count)(s, held, data)[0]))(jnp.stack([shared, shared]))
+    np.testing.assert_allclose(mapped[1], slope, rtol=1e-4, atol=1e-6)
+
+
+def test_blocks_do_not_say_that_a_term_has_no_gradient():
+    """What the blocks' gradient leaves out is refused: a zero would be wrong in silence."""
+    one_term = lambda s: in_blocks(quadratic, 2, where="here")(s, jnp.float32(1), normal(1, 8, 3))[1]["mean"]
+    with pytest.raises(ValueError, match="here: only the total has a gradient in 2 blocks"):
+        jax.grad(one_term)(normal(0, 3))
+    with pytest.raises(ValueError, match="here: 8 rays have no 3 equal blocks"):
+        in_blocks(quadratic, 3, where="here")(normal(0, 3), jnp.float32(1), normal(1, 8, 3))
 
 
 def test_a_few_steps_on_one_batch_reduce_the_loss():
@@ -127,20 +177,22 @@ def test_a_step_of_the_papers_system_with_all_its_losses_is_finite(change):
     step, init = stage.paper_step()
     params = stage.params_of(PAPER)
     after, state, terms = step(params, init(params), change(stage.batch(PAPER)))
-    assert {n for n, v in terms.items() if v is not None} == {
-        n for n, w in PAPER_WEIGHTS._asdict().items() if w is not None
-    } | {"total"}
+    assert terms.keys() == {*PAPER_WEIGHTS, "total"}
     assert_all_finite((after, terms))
     assert state.skipped == 0
     changed = jax.tree.map(lambda a, b: bool((a != b).any()), params, after)
-    parts = (changed.geometry, changed.motion, changed.static, changed.dynamic)
+    parts = (*changed.static, *changed.dynamic)
     assert change is not plain or all(any(jax.tree.leaves(part)) for part in parts)
 
 
-def traced(config, weights):
+def caught(system, weights=None):
+    """A step that hands back its gradient."""
+    return train_step(stage.objective(system, weights), Caught)
+
+
+def traced(system, weights):
     """Operations of a step's program."""
-    step = train_step(config, weights=measurable(config, weights), solver=Caught)
-    return stage.operations(step, stage.params_of(config), None, stage.batch(config))
+    return stage.operations(caught(system, weights), stage.params_of(system), None, stage.batch(system))
 
 
 def total(count):
@@ -149,29 +201,29 @@ def total(count):
 
 def test_a_loss_without_weight_is_not_in_the_program():
     whole = traced(PAPER, PAPER_WEIGHTS)
-    without = {name: traced(PAPER, PAPER_WEIGHTS._replace(**{name: 0})) for name in ("geo", "cyc", "sp")}
+    without = {name: traced(PAPER, PAPER_WEIGHTS | {name: 0}) for name in ("geo", "cyc", "sp")}
     assert all(total(count) < total(whole) for count in without.values())
-    assert total(traced(PAPER, PAPER_WEIGHTS._replace(geo=None))) == total(without["geo"])
+    assert total(traced(PAPER, PAPER_WEIGHTS | {"geo": None})) == total(without["geo"])
     # Without a loss on warped renders, the field is not followed to its neighbours at all.
-    still = traced(PAPER, PAPER_WEIGHTS._replace(pho=0, cyc=0))
+    still = traced(PAPER, PAPER_WEIGHTS | {"pho": 0, "cyc": 0})
     assert total(still) < 0.8 * total(whole)
 
 
 def test_a_static_scene_learns_without_a_dynamic_branch():
-    assert total(traced(STILL, FRAME_WEIGHTS)) < 0.75 * total(traced(MINI, FRAME_WEIGHTS))
-    out = jax.eval_shape(train_step(STILL, solver=Caught), stage.params_of(STILL), None, stage.batch(STILL))
-    assert out[0].dynamic is None and out[0].motion is None
-    learned = {"rec", "static_rec", "depth_ce", "frame_ce", "frame_mask", "total"}
-    assert {n for n, v in out[2].items() if v is not None} == learned
+    of_still, of_all = stage.usual_weights(STILL), stage.usual_weights(MINI)
+    assert total(traced(STILL, of_still)) < 0.75 * total(traced(MINI, of_all))
+    grads, _, terms = jax.eval_shape(caught(STILL), stage.params_of(STILL), None, stage.batch(STILL))
+    assert grads.dynamic is None
+    assert terms.keys() == {"rec", "static_rec", "depth_ce", "frame_ce", "frame_mask", "total"}
 
 
-@pytest.mark.parametrize("geometry, motion", [(True, False), (False, True), (False, False)])
+@pytest.mark.parametrize("name", ["without_motion_volume", "without_geometry_volume", "without_volumes"])
 @pytest.mark.parametrize("base", [MINI, PAPER], ids=["mini", "paper"])
-def test_every_ablation_has_a_step(base, geometry, motion):
-    config = dataclasses.replace(base, geometry=geometry, motion=motion)
-    weights = PAPER_WEIGHTS if base is PAPER else FRAME_WEIGHTS
-    step, params = train_step(config, weights=measurable(config, weights), solver=Caught), stage.params_of(config)
-    grads, _, terms = jax.eval_shape(step, params, None, stage.batch(base))
+def test_every_ablation_has_a_step(base, name):
+    system = getattr(presets, name)(base)
+    weights = PAPER_WEIGHTS if base is PAPER else stage.usual_weights(system)
+    params = stage.params_of(system)
+    grads, _, terms = jax.eval_shape(caught(system, weights), params, None, stage.batch(system))
     assert jax.tree.structure(grads) == jax.tree.structure(params) and terms["rec"].shape == ()
 
 
@@ -180,7 +232,7 @@ def test_every_ablation_has_a_step(base, geometry, motion):
 
 def scene_case():
     logits, moving = normal(0, 2, 3, 4, 6), normal(1, 2, 6, 8)
-    maps = FrameMaps(None, logits, None, None, moving)
+    maps = FrameMaps(logits, None, None, moving)
     geometry, motion = (Volume(None, normal(s, 5, 3, 4)) for s in (2, 3))
     batch = stage.batch()._replace(
         static_planes=np.full((3, 4), 1.25, np.float32), static_planes_valid=np.ones((3, 4), np.float32),
@@ -194,20 +246,20 @@ def scene_case():
 
 def test_scene_terms_are_those_of_a_loop():
     maps, encoded, batch = scene_case()
-    terms = scene_terms(maps, encoded, batch, FRAME_WEIGHTS)
+    terms = scene_terms(maps, encoded, batch, SIMULATED_WEIGHTS)
     wide = lambda x: np.asarray(x, np.float64)
     log = lambda x, axis: wide(x) - np.log(np.exp(wide(x)).sum(axis, keepdims=True))
     still, moved = log(encoded[0].logits, 0), log(encoded[1].logits, 0)
     expected = -np.mean(0.75 * still[1] + 0.25 * still[2]) - np.mean(np.diagonal(moved[2]))
-    np.testing.assert_allclose(terms.depth_ce, expected, rtol=1e-5)
+    np.testing.assert_allclose(terms["depth_ce"], expected, rtol=1e-5)
     frames = log(maps.logits, -1)[0]
     moving = wide(batch.frame_moving)[0].reshape(3, 2, 4, 2).mean((1, 3))
     share = (1 + (MOVER_SHARE - 1) * moving) / MOVER_SHARE
     expected = -np.average((frames[..., 4] + frames[..., 5]) / 2, weights=share)
-    np.testing.assert_allclose(terms.frame_ce, expected, rtol=1e-5)
+    np.testing.assert_allclose(terms["frame_ce"], expected, rtol=1e-5)
     logits = wide(maps.moving_logits)[0]
     np.testing.assert_allclose(
-        terms.frame_mask, np.mean(np.log1p(np.exp(logits)) - wide(batch.frame_moving)[0] * logits), rtol=1e-5
+        terms["frame_mask"], np.mean(np.log1p(np.exp(logits)) - wide(batch.frame_moving)[0] * logits), rtol=1e-5
     )
 
 
@@ -217,8 +269,8 @@ def test_scene_terms_are_finite_with_finite_gradients(size):
 
     def summed(scale):
         scaled = jax.tree.map(lambda x: scale * x, (maps, encoded))
-        terms = scene_terms(*scaled, batch, FRAME_WEIGHTS)
-        return terms.depth_ce + terms.frame_ce + terms.frame_mask
+        terms = scene_terms(*scaled, batch, SIMULATED_WEIGHTS)
+        return terms["depth_ce"] + terms["frame_ce"] + terms["frame_mask"]
 
     assert_all_finite(jax.jit(jax.value_and_grad(summed))(jnp.float32(size)))
 
@@ -239,20 +291,22 @@ def rates(count, *, steps, peak=2e-3, floor=2e-5, warmup=50):
     ],
     ids=["all told", "no warmup", "as it comes", "shorter than its warmup"],
 )  # fmt: skip
-def test_the_compiled_step_keeps_its_schedule(monkeypatch, count, options):
+def test_the_compiled_step_keeps_its_schedule(count, options):
     """Adam by hand at rates by hand, of gradients clipped by hand; the batch is the gradient."""
-    gradients = lambda params, batch: ({"w": batch}, Terms(rec=params["w"][0]), jnp.sum(params["w"]))
-    monkeypatch.setattr(learn, "step_gradients", lambda config, **_: gradients)
-    init, step = make_train_step(None, **options)
+    steps, rate = options.pop("steps"), Cosine(**options)
+    objective = lambda params, batch: (jnp.sum(params["w"] * batch), {"rec": params["w"][0]})
+    solver = Adam(learning_rate=lambda step: rate(step, steps=steps), clip_norm=1.0)
+    init, step = solver.init_state, jax.jit(train_step(objective, solver))
     params = {"w": jnp.zeros(2)}
     state, reached = init(params), []
     batches = normal(0, count, 2) * np.where(np.arange(count) % 3, 0.3, 5)[:, None].astype(np.float32)
     for batch in batches:
         params, state, terms = step(params, state, batch)
         reached.append(np.asarray(params["w"]))
-    assert set(terms) == {*Terms._fields, "total"}
+    assert terms.keys() == {"rec", "total"}
     wide = np.asarray(batches, np.float64)
     clipped = wide / np.maximum(np.linalg.norm(wide, axis=1, keepdims=True), 1)
+    options = options | {"steps": steps}
     expected = [adam_by_loop(clipped[:, i], 0, rate=list(rates(count, **options)), path=True) for i in range(2)]
     np.testing.assert_allclose(reached, np.transpose(expected), rtol=1e-4, atol=1e-5 * np.abs(expected).max())
 
@@ -260,15 +314,16 @@ def test_the_compiled_step_keeps_its_schedule(monkeypatch, count, options):
 # Stages.
 
 
+FRAMES, VIEWS = (stage_weights(name, weights=SIMULATED_WEIGHTS) for name in ("frames", "views"))
+
+
 def test_the_frames_stage_changes_the_analysis_alone_and_has_no_rays_in_its_program():
-    weights = stage_weights("frames")
-    assert frames_only(weights) and not frames_only(FRAME_WEIGHTS)
-    step, params, batch = train_step(MINI, weights=weights, solver=Caught), stage.params_of(MINI), frames()
+    step, params, batch = caught(MINI, FRAMES), stage.params_of(MINI), frames()
     grads, _, terms = jax.jit(step)(params, None, batch)
-    assert {n for n, v in terms.items() if v is not None} == {"frame_ce", "frame_mask", "total"}
+    assert terms.keys() == {"frame_ce", "frame_mask", "total"}
     largest = lambda tree: max(float(jnp.abs(g).max()) for g in jax.tree.leaves(tree))
     assert largest(grads.analysis) > 0 and largest(grads._replace(analysis=None)) == 0
-    assert total(stage.operations(step, params, None, batch)) < 0.5 * total(traced(MINI, FRAME_WEIGHTS))
+    assert total(stage.operations(step, params, None, batch)) < 0.5 * total(traced(MINI, SIMULATED_WEIGHTS))
 
 
 def frames():
@@ -276,7 +331,7 @@ def frames():
 
 
 def test_the_frames_stage_learns():
-    step, init = stage.step(MINI, stage_weights("frames"))
+    step, init = stage.step(MINI, FRAMES)
     params, batch = stage.params_of(MINI), frames()
     state, losses = init(params), []
     for _ in range(40):
@@ -286,25 +341,28 @@ def test_the_frames_stage_learns():
 
 
 def test_the_views_stage_holds_the_analysis():
-    step = train_step(MINI, weights=stage_weights("views"), solver=Caught)
-    grads, _, terms = jax.jit(step)(stage.params_of(MINI), None, stage.batch())
-    assert terms["frame_ce"] is None and terms["dynamic_rec"] is not None
+    grads, _, terms = jax.jit(caught(MINI, VIEWS))(stage.params_of(MINI), None, stage.batch())
+    assert "frame_ce" not in terms and "dynamic_rec" in terms
     assert all((g == 0).all() for g in jax.tree.leaves(grads.analysis))
-    assert any((g != 0).any() for g in jax.tree.leaves(grads.motion))
+    assert any((g != 0).any() for g in jax.tree.leaves(grads.dynamic.volume))
+
+
+def test_a_recipes_stage_is_that_of_its_weights():
+    assert dict(Recipe(MINI).stage("frames").weights.terms) == FRAMES
 
 
 def test_a_stage_that_there_is_not_is_refused():
     with pytest.raises(ValueError, match="stage_weights: `stage` is 'half'"):
-        stage_weights("half")
+        stage_weights("half", weights=SIMULATED_WEIGHTS)
 
 
 def test_what_is_not_finite_of_a_step_is_named_by_loss_frame_and_parameter():
     batch, params = stage.batch(MINI), stage.params_of(MINI)
-    sound = find_fault(params, batch, config=MINI)
+    sound = find_fault(stage.objective(MINI), params, batch)
     assert sound == Fault((), (), int(batch.inputs.time))
     colour = np.array(batch.truth.colour)
     colour[0] = np.nan
-    fault = find_fault(params, batch._replace(truth=batch.truth._replace(colour=colour)), config=MINI)
+    fault = find_fault(stage.objective(MINI), params, batch._replace(truth=batch.truth._replace(colour=colour)))
     assert "rec" in fault.terms and "flow3d" not in fault.terms
     assert fault.frame == int(batch.inputs.time) and any("static" in leaf for leaf in fault.leaves)
     assert "loss rec" in str(fault) and f"target frame {fault.frame}" in str(fault)

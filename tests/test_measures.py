@@ -9,38 +9,42 @@ import numpy as np
 import pytest
 import stage
 from oracles import weights_by_loop
-from stage import MINI, PAPER
+from stage import PAPER
 
-from zestjax import measures
+from zestjax.base.parts import part
 from zestjax.fields.conditioning import SourceViews
 from zestjax.fields.dynamic import DynamicSample
-from zestjax.losses.objective import PAPER_WEIGHTS, Terms, measured
-from zestjax.measures import encoding_slots, make_measures, slot_valid, warped
-from zestjax.model import Encoding, reference_frustum
-from zestjax.prediction import Prediction, march
+from zestjax.frames.selection import Slots
+from zestjax.losses.objective import PAPER_WEIGHTS, measured
+from zestjax.systems import presets
+from zestjax.systems.fields import Seen
+from zestjax.systems.sampling import march
+from zestjax.systems.system import Params, Prediction, Scene
+from zestjax.train import measures
+from zestjax.train.measures import make_measures, slot_valid, slots_about, warped
 
-ALL = PAPER_WEIGHTS._replace(static_rec=1.0, mask=1.0, flow3d=1.0)
+ALL = PAPER_WEIGHTS | dict(static_rec=1.0, mask=1.0, flow3d=1.0)
 
 
 @functools.cache
-def measure(config=PAPER, chain=False):
+def measure(system=PAPER, chain=False):
     """Compiled: (params, inputs, evidence, truth) -> every term, the prediction, and the paths followed."""
 
     def run(params, inputs, evidence, truth):
-        encoding = stage.encoded(params, inputs, evidence, config)
-        prediction = stage.render_rays(params, encoding, inputs, truth.pixels, config=config)
-        terms = make_measures(params, encoding, inputs, config=config, chain=chain)
-        paths = warped(params, encoding, inputs, prediction, config=config, chain=chain)
+        scene = stage.encoded(params, inputs, evidence, system)
+        prediction = system.render(params, scene, inputs, truth.pixels)
+        terms = make_measures(system, params, scene, inputs, chain=chain)
+        paths = warped(system, params, scene, inputs, prediction, chain=chain)
         return measured(terms, prediction, truth, ALL), prediction, paths
 
     return jax.jit(run)
 
 
-def case(config=PAPER):
+def case(system=PAPER):
     """Arguments of `measure`, for every third ray."""
-    batch = stage.batch(config)
-    truth = jax.tree.map(lambda x: x[::3], batch.truth)
-    return stage.params_of(config), batch.inputs, batch.evidence, truth
+    batch = stage.batch(system)
+    truth = jax.tree.map(lambda x: x[::3], batch.truth)._replace(jitter=None)
+    return stage.params_of(system), batch.inputs, batch.evidence, truth
 
 
 @pytest.fixture(scope="module")
@@ -49,35 +53,35 @@ def found():
 
 
 def test_a_slot_is_known_by_its_time_and_validity():
-    slots = encoding_slots(stage.inputs_of(time=5)[0])
+    slots = slots_about(stage.inputs_of(time=5)[0])
     assert [float(slot_valid(slots, k)) for k in (-1, 0, 1, 2)] == [1, 1, 0, 0]
-    slots = encoding_slots(stage.inputs_of(time=0)[0])
+    slots = slots_about(stage.inputs_of(time=0)[0])
     assert [float(slot_valid(slots, k)) for k in (-1, 0, 1)] == [0, 1, 1]
 
 
 def test_all_terms_are_finite_and_not_negative(found):
     terms = found[0]
-    for name, weight in ALL._asdict().items():
-        assert (getattr(terms, name) is None) == (weight is None), name
-        assert weight is None or (np.isfinite(getattr(terms, name)) and getattr(terms, name) >= 0), name
+    assert terms.keys() == ALL.keys()
+    for name, term in terms.items():
+        assert np.isfinite(term) and term >= 0, name
 
 
 def test_colour_terms_are_their_means(found):
     terms, shown, _ = found
     truth = case()[3]
-    np.testing.assert_allclose(terms.rec, np.mean((shown.colour - truth.colour) ** 2), rtol=1e-4)
+    np.testing.assert_allclose(terms["rec"], np.mean((shown.colour - truth.colour) ** 2), rtol=1e-4)
     static = np.mean((shown.static_colour - truth.static) ** 2, -1)
-    np.testing.assert_allclose(terms.static_rec, np.average(static, weights=truth.static_valid), rtol=1e-4)
+    np.testing.assert_allclose(terms["static_rec"], np.average(static, weights=truth.static_valid), rtol=1e-4)
     share = 1e-3 + (1 - 2e-3) * shown.dynamicness
     entropy = -(truth.moving * np.log(share) + (1 - truth.moving) * np.log(1 - share))
-    np.testing.assert_allclose(terms.mask, entropy.mean(), rtol=1e-4)
+    np.testing.assert_allclose(terms["mask"], entropy.mean(), rtol=1e-4)
 
 
 def test_the_photometric_term_compares_each_neighbours_warped_colour(found):
     terms, _, paths = found
     each = paths.confidence[..., None] * (paths.colour - case()[3].colour) ** 2
     assert paths.valid.tolist() == [1, 1] and paths.colour.shape[0] == 2
-    np.testing.assert_allclose(terms.pho, each.mean(), rtol=1e-4)
+    np.testing.assert_allclose(terms["pho"], each.mean(), rtol=1e-4)
 
 
 def test_flow_terms_are_their_means_in_world_units(found):
@@ -85,10 +89,10 @@ def test_flow_terms_are_their_means_in_world_units(found):
     there, back = paths.there, paths.back
     confidence = np.stack([shown.dynamic.confidence_forward, shown.dynamic.confidence_backward])
     assert there.shape == (2, *shown.weights.shape, 3)
-    np.testing.assert_allclose(terms.min, np.abs(there).mean(), rtol=1e-4)
-    np.testing.assert_allclose(terms.temp, np.mean((there[0] + there[1]) ** 2), rtol=1e-3)
-    np.testing.assert_allclose(terms.cyc, np.mean(confidence[..., None] * np.abs(there + back)), rtol=1e-4)
-    np.testing.assert_allclose(terms.w, np.mean(1 - confidence), rtol=1e-3)
+    np.testing.assert_allclose(terms["min"], np.abs(there).mean(), rtol=1e-4)
+    np.testing.assert_allclose(terms["temp"], np.mean((there[0] + there[1]) ** 2), rtol=1e-3)
+    np.testing.assert_allclose(terms["cyc"], np.mean(confidence[..., None] * np.abs(there + back)), rtol=1e-4)
+    np.testing.assert_allclose(terms["w"], np.mean(1 - confidence), rtol=1e-3)
 
 
 def test_the_flow_of_what_moves_is_compared_near_its_surface(found):
@@ -99,7 +103,7 @@ def test_the_flow_of_what_moves_is_compared_near_its_surface(found):
         np.minimum(np.abs(paths.there[i] - truth.flow[:, None, i]) / truth.depth[:, None, None], 1) for i in range(2)
     ]
     expected = 5 * sum(np.sum(near[..., None] * e) / max(3 * near.sum(), 1e-30) for e in error)
-    np.testing.assert_allclose(terms.flow3d, expected, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(terms["flow3d"], expected, rtol=1e-3, atol=1e-6)
 
 
 def test_a_neighbour_that_does_not_exist_counts_in_nothing():
@@ -108,7 +112,7 @@ def test_a_neighbour_that_does_not_exist_counts_in_nothing():
     terms, _, paths = measure()(params, alone, evidence, truth)
     assert not paths.valid.any()
     for name in ("pho", "w", "cyc", "min", "sp", "temp", "geo"):
-        assert getattr(terms, name) == 0, name
+        assert terms[name] == 0, name
 
 
 def test_what_is_not_known_counts_in_nothing():
@@ -120,7 +124,7 @@ def test_what_is_not_known_counts_in_nothing():
     )  # fmt: skip
     terms, _, _ = measure()(params, inputs, evidence, nothing)
     for name in ("depth", "geo", "flow3d", "static_rec"):
-        assert getattr(terms, name) == 0, name
+        assert terms[name] == 0, name
 
 
 def test_gradients_are_finite_where_nothing_is_known():
@@ -138,16 +142,16 @@ def gradient():
 
     def total(params, inputs, evidence, truth):
         terms, _, _ = measure()(params, inputs, evidence, truth)
-        return sum(t for t in terms if t is not None)
+        return sum(terms.values())
 
     return jax.jit(jax.grad(total))
 
 
 def test_smooth_terms_match_a_finite_difference_in_the_dynamic_field(x64):
     """Along one direction of the field's parameters, in float64."""
-    config = dataclasses.replace(PAPER, geometry=False, motion=False)
+    system = presets.without_volumes(PAPER)
     to64 = lambda tree: jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), tree)
-    params = to64(stage.params_of(config))
+    params = to64(stage.params_of(system))
     _, inputs, _, truth = to64(case())
     rng = np.random.default_rng(0)
     draw = lambda: jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)) / 10, params.dynamic)
@@ -157,11 +161,11 @@ def test_smooth_terms_match_a_finite_difference_in_the_dynamic_field(x64):
 
     def total(t):
         moved = params._replace(dynamic=jax.tree.map(lambda x, d: x + t * d, params.dynamic, direction))
-        encoding = stage.encoded(moved, inputs, None, config)
-        prediction = stage.render_rays(moved, encoding, inputs, truth.pixels, config=config)
-        terms = make_measures(moved, encoding, inputs, config=config)
-        weights = Terms(rec=1.0, w=1.0, temp=1.0, mask=1.0)  # pho holds its weights, by design
-        return sum(v for v in measured(terms, prediction, truth, weights) if v is not None)
+        scene = stage.encoded(moved, inputs, None, system)
+        prediction = system.render(moved, scene, inputs, truth.pixels)
+        terms = make_measures(system, moved, scene, inputs)
+        weights = dict(rec=1.0, w=1.0, temp=1.0, mask=1.0)  # pho holds its weights, by design
+        return sum(measured(terms, prediction, truth, weights).values())
 
     both = jax.jit(jax.value_and_grad(total))
     numeric = (both(jnp.float64(1e-6))[0] - both(jnp.float64(-1e-6))[0]) / 2e-6
@@ -182,37 +186,44 @@ def drifting(coords, time, xp=np):
     return DynamicSample(2 + wave(5, 2, 1, 0.7), colour, 0 * x, forward, backward, *certain)
 
 
-CHAINED = dataclasses.replace(PAPER, slots=(-2, -1, 0, 1, 2))
+@part
+class Drifting:
+    """A dynamic field that is written down, and says where it is asked."""
+
+    frames: Slots = Slots((-2, -1, 0, 1, 2))
+
+    def __call__(self, params, seen, marched, place):
+        assert place.duration == stage.FRAMES
+        ASKED.append((int(place.time), (seen.views.times + place.time).tolist()))
+        return drifting(marched.coords, jnp.float32(place.time), jnp)
+
+
+ASKED: list = []
+PARAMS = Params(None, None, None)
+CHAINED = dataclasses.replace(PAPER, dynamic=Drifting())
 
 
 @pytest.fixture
-def followed(monkeypatch):
+def followed():
     """Compiled: (which slots are valid, chain) -> `Warped`, photometric term; what it started from; where it asked."""
-    asked = []
-
-    def query(params, encoding, coords, directions, time, duration, *, config):
-        assert len(directions) == len(coords) and duration == stage.FRAMES
-        asked.append((int(time), (encoding.slots.times + time).tolist()))
-        return drifting(coords, jnp.float32(time), jnp)
-
-    monkeypatch.setattr(measures, "query_dynamic", query)
     inputs = stage.inputs_of(CHAINED, time=2)[0]
-    slots = SourceViews(None, None, inputs.slots.valid, encoding_slots(inputs).times)
-    encoding = Encoding(None, None, None, slots, reference_frustum(inputs, CHAINED), None)
+    slots = SourceViews(None, None, inputs.slots.valid, slots_about(inputs).times)
+    frustum = CHAINED.space.frustum(inputs)
+    scene = Scene(frustum, Seen(None, None), Seen(None, slots), None)
     pixels = np.array([[3, 4], [12, 8], [20, 11]], np.float32)
-    marched = march(encoding, inputs.camera, inputs.near, inputs.far, pixels, config=CHAINED)
+    marched = march(CHAINED.sampler, CHAINED.space, frustum, None, inputs, pixels)
     prediction = Prediction(*[None] * 11, drifting(marched.coords, 2.0, jnp), marched)
     shown = case()[3]._replace(colour=np.linspace(0, 1, 9, dtype=np.float32).reshape(3, 3))
 
     @functools.partial(jax.jit, static_argnames="chain")
     def run(valid, *, chain):
-        asked.clear()
-        given = (None, encoding, inputs._replace(slots=inputs.slots._replace(valid=valid)))
-        terms = make_measures(*given, config=CHAINED, chain=chain)
-        paths = warped(*given, prediction, config=CHAINED, chain=chain)
-        return paths, terms.pho(prediction, shown)
+        ASKED.clear()
+        given = (CHAINED, PARAMS, scene, inputs._replace(slots=inputs.slots._replace(valid=valid)))
+        paths = warped(*given, prediction, chain=chain)
+        terms = make_measures(*given, chain=chain)
+        return paths, terms["pho"](prediction, shown)
 
-    return run, jax.tree.map(lambda x: np.asarray(x, np.float64), marched), shown.colour, encoding.frustum, asked
+    return run, jax.tree.map(lambda x: np.asarray(x, np.float64), marched), shown.colour, frustum, ASKED
 
 
 def in_world(frustum, coords):
@@ -271,7 +282,7 @@ def test_a_chain_goes_on_from_where_the_step_before_ended(followed):
 def test_a_chain_ends_at_the_first_frame_that_is_missing(followed, missing, valid):
     """A frame two away does not count where the one between does not exist, and in no mean."""
     run, marched, target, frustum, _ = followed
-    present = np.array([offset not in missing for offset in CHAINED.slots], np.float32)
+    present = np.array([offset not in missing for offset in CHAINED.dynamic.frames.offsets], np.float32)
     paths, pho = run(present, chain=True)
     assert paths.valid.tolist() == list(valid)
     shown, _ = followed_by_loop(marched, frustum)
@@ -281,11 +292,6 @@ def test_a_chain_ends_at_the_first_frame_that_is_missing(followed, missing, vali
 
 def test_at_a_neighbour_the_slots_are_named_from_its_own_time():
     """At t + 1 the slot of time t + 1 is read where the point is, not one flow away."""
-    whole = stage.batch(MINI)
-    shift = lambda inputs: jax.eval_shape(
-        lambda p, i, e: stage.encoded(p, i, e, MINI), stage.params_of(MINI), inputs, whole.evidence
-    )
-    encoding = shift(whole.inputs)
-    encoding = encoding._replace(slots=encoding.slots._replace(times=np.array([-1.0, 0, 1])))
-    assert measures._seen_from(encoding, 1).slots.times.tolist() == [-2, -1, 0]
-    assert measures._seen_from(encoding._replace(slots=None), 1).slots is None
+    views = SourceViews(None, None, None, np.array([-1.0, 0, 1]))
+    assert measures._seen_from(Seen(None, views), 1).views.times.tolist() == [-2, -1, 0]
+    assert measures._seen_from(Seen(None, None), 1).views is None

@@ -11,27 +11,37 @@ import stage
 from oracles import assert_grads_match, uniform
 from stage import MINI, PAPER, STILL
 
-from zestjax import model, prediction
 from zestjax.cameras import Camera, project
-from zestjax.evidence import FLOW_CHANNELS, Evidence
+from zestjax.fields.heads import Blend, Direct
 from zestjax.fields.static import StaticSample
-from zestjax.presets import PRESETS, preset
+from zestjax.frames.cells import cells_of, grown
+from zestjax.frames.evidence import FLOW_CHANNELS, Evidence
 from zestjax.rays import depths_from_fractions
+from zestjax.systems import presets
+from zestjax.systems.fields import Dynamic, Static
+from zestjax.systems.sampling import Even, Guided, march
+from zestjax.systems.swept import Pyramid, Swept
+from zestjax.systems.system import Space, System, filled, last_resort
+from zestjax.train.recipes import RECIPES
+from zestjax.video import Frames, Inputs
 
 
-def shapes_of(config):
-    return jax.eval_shape(functools.partial(model.init_params, config=config), jax.random.key(0))
+def shapes_of(system):
+    return jax.eval_shape(system.init, jax.random.key(0))
 
 
-def evidence_of(config=MINI, seed=0):
-    """Bytes of evidence of K key-frames and M slots."""
+def evidence_of(system=MINI, seed=0):
+    """Bytes of evidence of K key-frames and M slots; None in a system that asks no frame."""
+    if system.frames is None:
+        return None
     draw = lambda *s: np.random.default_rng(seed).integers(0, 256, s).astype(np.uint8)
-    views, planes = config.key_frames + len(config.slots), config.evidence_planes
+    views = system.static.frames.count + (0 if system.dynamic is None else system.dynamic.frames.count)
+    planes = system.frames.planes
     return Evidence(*(draw(views, 4, 6, n) for n in (planes, planes, planes, planes, FLOW_CHANNELS, 2, 12)))
 
 
-def rendered(params, inputs, evidence, config=MINI):
-    return stage.forward(config)(params, inputs, evidence, stage.pixels())
+def rendered(params, inputs, evidence, system=MINI):
+    return stage.forward(system)(params, inputs, evidence, stage.pixels())
 
 
 def assert_same(a, b):
@@ -46,81 +56,111 @@ def assert_all_finite(tree):
 # Presets and parameters.
 
 
-@pytest.mark.parametrize("name", list(PRESETS))
+@pytest.mark.parametrize("name", list(RECIPES))
 def test_a_preset_has_the_parts_it_names(name):
-    config, params = PRESETS[name], shapes_of(PRESETS[name])
-    assert params.geometry and params.motion and params.static and params.dynamic
-    assert (params.analysis is None) == (config.encoder == "pyramid") == (params.static.views is None)
+    system = RECIPES[name].system
+    params = shapes_of(system)
+    assert params.static.volume and params.dynamic.volume and params.static.net and params.dynamic.net
+    assert (params.analysis is None) == (name == "paper") == (params.static.net.head.views is None)
     assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(params))
 
 
-@pytest.mark.parametrize(
-    "geometry, motion, dynamic",
-    [(True, True, True), (True, False, True), (False, True, True), (False, False, True), (False, True, False)],
-)
+ABLATIONS = {
+    "both volumes": lambda system: system,
+    "geometry volume": presets.without_motion_volume,
+    "motion volume": presets.without_geometry_volume,
+    "neither": presets.without_volumes,
+    "still": presets.still,
+    "still without volumes": lambda system: presets.still(presets.without_volumes(system)),
+}
+
+
+@pytest.mark.parametrize("name", ABLATIONS)
 @pytest.mark.parametrize("base", [MINI, PAPER], ids=["mini", "paper"])
-def test_every_ablation_traces_and_lacks_what_it_switches_off(base, geometry, motion, dynamic):
-    config = dataclasses.replace(base, geometry=geometry, motion=motion, dynamic=dynamic)
-    params = shapes_of(config)
-    assert (params.geometry is not None) == geometry and (params.dynamic is not None) == dynamic
-    assert (params.motion is not None) == (motion and dynamic)
-    used = config.encoder == "frames" and (geometry or (motion and dynamic))
-    assert (params.analysis is not None) == used
-    inputs, evidence = stage.inputs_of(config)[0], evidence_of(config) if used else None
-    out = jax.eval_shape(functools.partial(stage.rays, config=config), params, inputs, evidence, stage.pixels())
-    assert out.colour.shape == (64, 3) and out.depth.shape == (64,) and (out.dynamic is None) == (not dynamic)
+def test_every_ablation_traces_and_lacks_what_it_leaves_out(base, name):
+    system = ABLATIONS[name](base)
+    params = shapes_of(system)
+    assert (params.static.volume is None) == (name in ("motion volume", "neither", "still without volumes"))
+    assert (params.dynamic is None) == name.startswith("still")
+    assert params.dynamic is None or (params.dynamic.volume is None) == (name in ("geometry volume", "neither"))
+    assert (params.analysis is not None) == (base is MINI and "without" not in name and name != "neither")
+    inputs, evidence = stage.inputs_of(system)[0], evidence_of(system)
+    out = jax.eval_shape(functools.partial(stage.rays, system=system), params, inputs, evidence, stage.pixels())
+    assert out.colour.shape == (64, 3) and out.depth.shape == (64,)
+    assert (out.dynamic is None) == (system.dynamic is None) == (inputs.slots is None)
 
 
 def test_the_papers_preset_has_the_papers_shapes():
-    config = PRESETS["paper"]
-    params = shapes_of(config)
-    assert params.geometry.regulariser.stem.conv.kernel.shape[-2] == 32 + 3 * 8
-    assert params.motion.regulariser.stem.conv.kernel.shape[-2] == 32 + 3 * 4
-    assert [k.kernel.shape for k in params.static.trunk.layers] == [(63, 256), *[(256, 256)] * 4, (319, 256)] + [
+    system = presets.PAPER
+    params = shapes_of(system)
+    static, dynamic = params.static, params.dynamic
+    assert static.volume.regulariser.stem.conv.kernel.shape[-2] == 32 + 3 * 8
+    assert dynamic.volume.regulariser.stem.conv.kernel.shape[-2] == 32 + 3 * 4
+    assert [k.kernel.shape for k in static.net.trunk.layers] == [(63, 256), *[(256, 256)] * 4, (319, 256)] + [
         (256, 256)
     ] * 2
-    assert params.dynamic.trunk.layers[0].kernel.shape == (84, 256)
-    assert params.static.trunk.condition.kernel.shape == (8 + 4 * 8, 256)
-    assert params.static.colour.hidden.kernel.shape == (256 + 27, 128)
+    assert dynamic.net.trunk.layers[0].kernel.shape == (84, 256)
+    assert static.net.trunk.condition.kernel.shape == (8 + 4 * 8, 256)
+    assert static.net.head.colour.hidden.kernel.shape == (256 + 27, 128)
 
-    frames = lambda n: model.Frames(spec(n, 288, 512, 3), Camera(spec(n, 3, 3), spec(n, 4, 4)), spec(n), spec(n))
+    frames = lambda n: Frames(spec(n, 288, 512, 3), Camera(spec(n, 3, 3), spec(n, 4, 4)), spec(n), spec(n))
     spec = lambda *s: jax.ShapeDtypeStruct(s, jnp.float32)
-    inputs = model.Inputs(frames(8), frames(4), Camera(spec(3, 3), spec(4, 4)), *[spec()] * 4)
-    encode = functools.partial(model.encode, config=config)
-    encoding = jax.eval_shape(lambda p, i: encode(p, i, None)[:4], params, inputs)
-    assert encoding[0].cells.shape == encoding[1].cells.shape == (128, 72, 128, 8)
-    out = jax.eval_shape(functools.partial(stage.rays, config=config), params, inputs, None, spec(100, 2))
+    inputs = Inputs(frames(8), frames(4), Camera(spec(3, 3), spec(4, 4)), *[spec()] * 4)
+    volumes = lambda p, i: [seen.volume.cells for seen in system.encode(p, i, None)[1:3]]
+    assert [v.shape for v in jax.eval_shape(volumes, params, inputs)] == [(128, 72, 128, 8)] * 2
+    out = jax.eval_shape(functools.partial(stage.rays, system=system), params, inputs, None, spec(100, 2))
     assert out.weights.shape == (100, 128) and out.dynamic.flow_forward.shape == (100, 128, 3)
 
 
 @pytest.mark.parametrize(
     "wrong, message",
     [
-        (dict(head="direct"), "do not fit"), (dict(encoder="pyramid"), "do not fit"),
-        (dict(conditioning="concatenated"), "do not fit"), (dict(reference="key_frame"), "guided sampling"),
-        (dict(planes=1), "at least 2"), (dict(spacing="log"), "spacing"),
+        (lambda: dataclasses.replace(MINI, space=Space(5, camera="key_frame")), "a guided sampler .* key_frame's"),
+        (lambda: dataclasses.replace(presets.without_volumes(MINI), sampler=Guided()), "guided sampler with 0 volumes"),
+        (lambda: dataclasses.replace(MINI, static=Static(volume=Swept(occupied=False))), "volume without logits"),
+        (lambda: dataclasses.replace(MINI, frames=None), "own depths without `frames`"),
+        (lambda: dataclasses.replace(PAPER, frames=MINI.frames), "no volume's tables read"),
+        (lambda: dataclasses.replace(MINI, precision="float16"), "precision"),
+        (lambda: Static(volume=None, head=Blend()), "Static: the head looks at views"),
+        (lambda: Dynamic(volume=None), "Dynamic: the head looks at views"),
+        (lambda: Dynamic(depth=0), "Dynamic: `depth` is 0, expected an integer from 1"),
+        (lambda: Static(width=2.0), "Static: `width` is 2.0"),
+        (lambda: Static(modulation="subtract"), "modulation"),
+        (lambda: Space(1), "Space: `planes` is 1, expected an integer from 2"),
+        (lambda: Space(4, "log"), "spacing"),
+        (lambda: Even(0), "Even: `samples` is 0"),
+        (lambda: Even(4, "metre"), "unit"),
+        (lambda: Pyramid(2), "Pyramid: `channels` is 2"),
+        (lambda: Swept(widths=(8, 0)), r"Swept: `widths\[1\]` is 0"),
     ],
-)  # fmt: skip
+)
 def test_choices_that_do_not_fit_are_refused(wrong, message):
     with pytest.raises(ValueError, match=message):
-        preset("small", **wrong)
-    with pytest.raises(ValueError, match="small"):
-        preset("large")
+        wrong()
+
+
+def test_systems_are_values():
+    """Compared and hashed by what they are made of, so that equal ones share a compiled program."""
+    again = System(
+        Space(5), dataclasses.replace(MINI.static), dataclasses.replace(MINI.dynamic), Guided(), frames=MINI.frames
+    )
+    assert again == MINI and hash(again) == hash(MINI) and again is not MINI
+    assert dataclasses.replace(MINI, space=Space(6)) != MINI
+    assert presets.NEITHER == presets.without_motion_volume(presets.MOTION)
+    assert presets.SVS == dataclasses.replace(presets.PAPER, dynamic=None) and Direct() == Direct()
 
 
 # What is off is not in the program.
 
 
-def program(config):
-    params = stage.params_of(config)
-    inputs = stage.inputs_of(config)[0]
-    evidence = evidence_of(config) if params.analysis is not None else None
-    return stage.operations(functools.partial(stage.rays, config=config), params, inputs, evidence, stage.pixels())
+def program(system):
+    arguments = stage.params_of(system), stage.inputs_of(system)[0], evidence_of(system), stage.pixels()
+    return stage.operations(functools.partial(stage.rays, system=system), *arguments)
 
 
 def test_a_static_scene_has_neither_a_dynamic_field_nor_a_motion_volume_in_its_program():
     whole, still = program(MINI), program(STILL)
-    without = program(dataclasses.replace(MINI, motion=False))
+    without = program(presets.without_motion_volume(MINI))
     for name in ("conv_general_dilated", "scan", "gather"):  # the motion volume's
         assert still[name] == without[name] < whole[name]
     assert still["dot_general"] < without["dot_general"] < whole["dot_general"]
@@ -129,11 +169,9 @@ def test_a_static_scene_has_neither_a_dynamic_field_nor_a_motion_volume_in_its_p
     )  # each volume is one sweep; one looks for the frames' ground
 
 
-def test_slots_are_not_read_by_a_static_scene():
-    inputs, params = stage.inputs_of(STILL)[0], stage.params_of(STILL)
-    changed = inputs._replace(slots=jax.tree.map(lambda x: x + 1, inputs.slots))
-    evidence = evidence_of()
-    assert_same(rendered(params, inputs, evidence, STILL), rendered(params, changed, evidence, STILL))
+def test_slots_are_not_even_among_the_inputs_of_a_static_scene():
+    inputs, frames = stage.inputs_of(STILL)
+    assert inputs.slots is None and len(frames) == STILL.static.frames.count
 
 
 # What is not valid says nothing.
@@ -162,24 +200,29 @@ def test_a_valid_frame_matters():
 # Nothing breaks.
 
 
+def both(inputs, change):
+    """Inputs with the frames of either field changed."""
+    return inputs._replace(key=change(inputs.key), slots=None if inputs.slots is None else change(inputs.slots))
+
+
 def blind(inputs):
     """Inputs whose source cameras all look away from the target's view."""
     away = np.diag([-1.0, 1, -1, 1]).astype(np.float32)
     turn = lambda f: f._replace(
         cameras=f.cameras._replace(camera_from_world=away @ np.asarray(f.cameras.camera_from_world))
     )
-    return inputs._replace(key=turn(inputs.key), slots=turn(inputs.slots))
+    return both(inputs, turn)
 
 
 def without_frames(inputs):
     none = lambda f: f._replace(valid=np.zeros_like(f.valid))
-    return inputs._replace(key=none(inputs.key), slots=none(inputs.slots))
+    return both(inputs, none)
 
 
-def filled(value):
+def painted(value):
     def fill(inputs):
         paint = lambda f: f._replace(images=jnp.full_like(f.images, value))
-        return inputs._replace(key=paint(inputs.key), slots=paint(inputs.slots))
+        return both(inputs, paint)
 
     return fill
 
@@ -189,11 +232,7 @@ def identical(inputs):
         images=jnp.broadcast_to(f.images[:1], f.images.shape),
         cameras=jax.tree.map(lambda x: np.repeat(x[:1], len(x), 0), f.cameras),
     )
-    return inputs._replace(
-        key=same(inputs.key),
-        slots=same(inputs.slots),
-        camera=jax.tree.map(lambda x: jnp.asarray(x[0]), inputs.key.cameras),
-    )
+    return both(inputs, same)._replace(camera=jax.tree.map(lambda x: jnp.asarray(x[0]), inputs.key.cameras))
 
 
 def far_away(inputs):
@@ -201,16 +240,15 @@ def far_away(inputs):
     return inputs._replace(near=np.float32(1e-3), far=np.float32(1e5))
 
 
-EXTREMES = [lambda i: i, blind, without_frames, filled(0.0), filled(1.0), identical, far_away]
+EXTREMES = [lambda i: i, blind, without_frames, painted(0.0), painted(1.0), identical, far_away]
 NAMES = ["plain", "blind", "no frames", "black", "white", "identical", "far"]
 
 
 @pytest.mark.parametrize("change", EXTREMES, ids=NAMES)
-@pytest.mark.parametrize("config", [MINI, STILL, PAPER], ids=["mini", "still", "paper"])
-def test_renders_are_finite_and_bounded_whatever_the_frames(config, change):
-    params, (inputs, _) = stage.params_of(config), stage.inputs_of(config)
-    evidence = evidence_of(config) if params.analysis is not None else None
-    out = rendered(params, change(inputs), evidence, config)
+@pytest.mark.parametrize("system", [MINI, STILL, PAPER], ids=["mini", "still", "paper"])
+def test_renders_are_finite_and_bounded_whatever_the_frames(system, change):
+    params, (inputs, _) = stage.params_of(system), stage.inputs_of(system)
+    out = rendered(params, change(inputs), evidence_of(system), system)
     assert_all_finite(out)
     for share in (out.colour, out.static_colour, out.dynamicness):
         assert (share > -1e-4).all() and (share < 1 + 1e-3).all()
@@ -221,42 +259,47 @@ def test_renders_are_finite_and_bounded_whatever_the_frames(config, change):
 def test_a_filled_ray_shows_a_mean_of_colours(opacity):
     colour, behind = opacity * jnp.asarray([[0.2, 0.5, 1.0]]), jnp.asarray([[1.0, 0.5, 0.2]])
     share = min(opacity, 1)
-    found = prediction.filled(colour, jnp.full((1,), opacity), behind)
+    found = filled(colour, jnp.full((1,), opacity), behind)
     np.testing.assert_allclose(found, share * np.array([[0.2, 0.5, 1.0]]) + (1 - share) * behind, rtol=1e-5)
 
 
+def marching(planes, samples, spacing="inverse"):
+    """A still system without volumes, its inputs; (inputs, pixels, jitter) -> `Marched`."""
+    system = dataclasses.replace(
+        presets.still(presets.without_volumes(MINI)), space=Space(planes, spacing), sampler=Even(samples)
+    )
+    inputs = stage.inputs_of(system)[0]
+
+    def run(inputs, pixels, jitter=None):
+        frustum = system.space.frustum(inputs)
+        return march(system.sampler, system.space, frustum, None, inputs, pixels, jitter=jitter)
+
+    return system, inputs, run
+
+
 def test_half_an_infinite_plane_is_held_at_a_finite_distance():
-    config = dataclasses.replace(STILL, geometry=False, planes=3, samples=1)
-    inputs = stage.inputs_of(config)[0]._replace(near=np.float32(1.0), far=np.float32(2.0))
-    encoding = stage.encoded(None, inputs, None, config)
+    _, inputs, run = marching(planes=3, samples=1)
+    inputs = inputs._replace(near=np.float32(1.0), far=np.float32(2.0))
     one = depths_from_fractions(jnp.float32(1), inputs.near, 1.5 * inputs.far, spacing="inverse")
     assert one == 3
-    marched = prediction.march(encoding, inputs.camera, inputs.near, inputs.far, jnp.zeros((1, 2)), config=config)
-    assert_all_finite(marched)
+    assert_all_finite(run(inputs, jnp.zeros((1, 2))))
     # 1 / depth is 0 one plane past the middle sample where 2 far / near = 2 (planes - 1) = 4.
-    marched = prediction.march(
-        encoding, inputs.camera, jnp.float32(1), jnp.float32(4 / 3), jnp.zeros((1, 2)), config=config
-    )
-    assert_all_finite(marched)
+    assert_all_finite(run(inputs._replace(near=jnp.float32(1), far=jnp.float32(4 / 3)), jnp.zeros((1, 2))))
 
 
 @pytest.fixture(params=["depth", "inverse"])
 def jittered(request):
-    """Compiled: places in the strata -> `Marched` of five samples a ray; the configuration; the inputs; the pixels."""
-    config = dataclasses.replace(STILL, geometry=False, samples=5, spacing=request.param)
-    inputs = stage.inputs_of(config)[0]
-    encoding, pixels = stage.encoded(None, inputs, None, config), stage.pixels()
-    run = lambda jitter: prediction.march(
-        encoding, inputs.camera, inputs.near, inputs.far, pixels, config=config, jitter=jitter
-    )
-    return jax.jit(run), config, inputs, pixels, encoding
+    """Compiled: places in the strata -> `Marched` of five samples a ray; the system; the inputs; the pixels."""
+    system, inputs, run = marching(planes=5, samples=5, spacing=request.param)
+    pixels = stage.pixels()
+    return jax.jit(lambda jitter: run(inputs, pixels, jitter)), system, inputs, pixels
 
 
 def test_jittered_samples_are_each_in_its_stratum(jittered):
-    run, config, _, pixels, _ = jittered
+    run, system, _, pixels = jittered
     draw = lambda key: jax.random.uniform(jax.random.key(key), (len(pixels), 5))
     found = [jax.tree.map(lambda x: np.asarray(x, np.float64), run(draw(key))) for key in (0, 1, 0)]
-    even = (lambda d: d) if config.spacing == "depth" else (lambda d: 1 / d)
+    even = (lambda d: d) if system.space.spacing == "depth" else (lambda d: 1 / d)
     near, far = even(stage.NEAR), even(stage.FAR)
     for marched, key in zip(found, (0, 1, 0), strict=True):
         fractions = (even(marched.depths) - near) / (far - near)
@@ -274,19 +317,18 @@ def test_jittered_samples_are_each_in_its_stratum(jittered):
 
 
 def test_jitter_is_about_the_regular_samples(jittered):
-    run, config, inputs, pixels, encoding = jittered
+    run, system, inputs, pixels = jittered
     same = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-5)
     jax.tree.map(same, run(jnp.full((len(pixels), 5), 0.5)), run(None))
-    even = (lambda d: d) if config.spacing == "depth" else (lambda d: 1 / d)
+    even = (lambda d: d) if system.space.spacing == "depth" else (lambda d: 1 / d)
     draws = [np.random.default_rng(key).uniform(size=(len(pixels), 5)).astype(np.float32) for key in range(20)]
     mean = np.mean([even(np.asarray(run(draw).depths, np.float64)) for draw in draws], (0, 1))
     width = abs(even(stage.FAR) - even(stage.NEAR)) / 5
     regular = even(np.asarray(run(None).depths, np.float64)[0])
     assert (abs(mean - regular) < 5 * width / np.sqrt(12 * 20 * len(pixels))).all()
-    params = stage.params_of(config)
-    rendered = jax.jit(
-        lambda jitter: prediction.render_rays(params, encoding, inputs, pixels, config=config, jitter=jitter).marched
-    )
+    params = stage.params_of(system)
+    scene = system.encode(params, inputs, None)
+    rendered = jax.jit(lambda jitter: system.render(params, scene, inputs, pixels, jitter=jitter).marched)
     np.testing.assert_allclose(rendered(draws[0]).depths, run(draws[0]).depths, rtol=1e-6)
 
 
@@ -295,12 +337,12 @@ def test_jitter_is_about_the_regular_samples(jittered):
 
 @pytest.mark.parametrize("size", [1, 2, 5, 9, 13, 16])
 def test_maps_grow_to_where_their_cells_are(size):
-    cells = model.cells_of(size)
+    cells = cells_of(size)
     for factor, count in ((4, cells), (2, 2 * cells)):
         ramp = jnp.broadcast_to(jnp.arange(count, dtype=jnp.float32)[None, :, None], (1, count, count))
-        grown = model._grown(ramp, (size, size), factor=factor)
+        wide = grown(ramp, (size, size), factor=factor)
         expected = np.clip((np.arange(size) - (factor - 1) / 2) / factor, 0, count - 1)
-        np.testing.assert_allclose(grown[0, :, 0], expected, atol=1e-5)
+        np.testing.assert_allclose(wide[0, :, 0], expected, atol=1e-5)
 
 
 def guided_by_loop(guides, pixels):
@@ -325,19 +367,19 @@ def test_rays_are_sampled_at_their_cells_surfaces(shape):
     guides = uniform(0, *shape)
     pixels = jnp.asarray([[0, 0], [23, 15], [1.5, 1.5], [7, 9], [-3, 40], [12.3, 4.1]], jnp.float32)
     np.testing.assert_allclose(
-        prediction.guided_coordinates(guides, pixels), guided_by_loop(guides, pixels), rtol=1e-5, atol=1e-6
+        Guided().fractions(guides, pixels, None), guided_by_loop(guides, pixels), rtol=1e-5, atol=1e-6
     )
 
 
 def test_guided_coordinates_match_finite_differences(x64):
     pixels = uniform(1, 5, 2, low=2, high=12, dtype=jnp.float64)
-    assert_grads_match(prediction.guided_coordinates, uniform(0, 2, 4, 6, dtype=jnp.float64), pixels)
+    assert_grads_match(lambda g, p: Guided().fractions(g, p, None), uniform(0, 2, 4, 6, dtype=jnp.float64), pixels)
 
 
-@pytest.mark.parametrize("config", [MINI, PAPER], ids=["guided", "regular"])
-def test_samples_lie_on_their_rays_between_the_bounds(config):
-    params, (inputs, _) = stage.params_of(config), stage.inputs_of(config)
-    out = rendered(params, inputs, evidence_of(config) if params.analysis is not None else None, config)
+@pytest.mark.parametrize("system", [MINI, PAPER], ids=["guided", "regular"])
+def test_samples_lie_on_their_rays_between_the_bounds(system):
+    params, (inputs, _) = stage.params_of(system), stage.inputs_of(system)
+    out = rendered(params, inputs, evidence_of(system), system)
     marched = out.marched
     assert (np.diff(marched.depths) >= 0).all()
     assert marched.depths.min() >= stage.NEAR - 1e-4 and marched.depths.max() <= stage.FAR + 1e-4
@@ -345,15 +387,15 @@ def test_samples_lie_on_their_rays_between_the_bounds(config):
     np.testing.assert_allclose(shown.pixels, np.broadcast_to(stage.pixels()[:, None], shown.pixels.shape), atol=1e-3)
     np.testing.assert_allclose(shown.depth, marched.depths, rtol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(marched.directions, axis=-1), 1, rtol=1e-5)
-    if config is PAPER:
+    if system is PAPER:
         spread = np.linalg.norm(marched.points[:, -1] - marched.points[:, 0], axis=-1) * 4 / 3
         np.testing.assert_allclose(marched.lengths.sum(-1), spread, rtol=1e-4)
 
 
 def test_a_ray_that_sees_nothing_shows_its_samples_by_density():
     sample = lambda density: StaticSample(density, jnp.asarray([[[1.0, 0, 0], [0, 0, 1]]]), density, density)
-    np.testing.assert_allclose(prediction.last_resort(sample(jnp.zeros((1, 2)))), [[0.5, 0, 0.5]])
-    np.testing.assert_allclose(prediction.last_resort(sample(jnp.asarray([[3.0, 1]]))), [[0.75, 0, 0.25]], rtol=1e-5)
+    np.testing.assert_allclose(last_resort(sample(jnp.zeros((1, 2)))), [[0.5, 0, 0.5]])
+    np.testing.assert_allclose(last_resort(sample(jnp.asarray([[3.0, 1]]))), [[0.75, 0, 0.25]], rtol=1e-5)
 
 
 def test_colours_and_weights_agree_with_each_other():

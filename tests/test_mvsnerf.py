@@ -3,6 +3,7 @@
 `experiments/check_parity.py` compares them; here it must also fail where something is wrong, and fix no size.
 """
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -13,12 +14,14 @@ import numpy as np
 import pytest
 from oracles import GOLDEN, golden, of_experiments
 
-from zestjax import mvsnerf
+from zestjax import novel_view
+from zestjax.apps.cli import main
 from zestjax.apps.weights import open_weights
 from zestjax.cameras import Camera
-from zestjax.cli import main
 from zestjax.io.mvsnerf import mvsnerf_like, mvsnerf_params
 from zestjax.io.weights import WeightsError
+from zestjax.systems.mvsnerf import MVSNERF, Ends, MvsNerf
+from zestjax.systems.system import Params
 from zestjax.video import Video
 
 check_parity = of_experiments("check_parity")
@@ -172,10 +175,10 @@ def test_import_writes_what_evaluate_opens(tmp_path, made):
             main(["import-mvsnerf", str(tmp_path / "mvsnerf.npz"), "--out", str(out), "--statistics", statistics]) == 0
         )
         model = open_weights(out, published=True)
-        assert model.system == "mvsnerf" and (model.params.features.blocks[0].norm.statistics is None) == (
-            statistics == "batch"
-        )
-        np.testing.assert_array_equal(model.params.field.trunk.layers[5].kernel, made.field.trunk.layers[5].kernel)
+        field = model.params.static
+        assert model.name == "mvsnerf" and model.system.static == MvsNerf(statistics=statistics)
+        assert (field.features.blocks[0].norm.statistics is None) == (statistics == "batch")
+        np.testing.assert_array_equal(field.field.trunk.layers[5].kernel, made.field.trunk.layers[5].kernel)
         with pytest.raises(WeightsError, match="which only `render` and `evaluate` can use"):
             open_weights(out)
 
@@ -203,15 +206,19 @@ def test_a_view_is_rendered_from_the_three_nearest(made):
     pose[:, 0, 3] = -np.arange(5)
     k = np.tile(np.array([[30, 0, 16], [0, 30, 12], [0, 0, 1]], np.float32), (5, 1, 1))
     video = Video(rng.uniform(size=(5, 24, 32, 3)).astype(np.float32), Camera(k, pose), np.float32(2), np.float32(6))
-    config = mvsnerf.MvsNerfConfig(planes=8, padding=4, samples=4)
-    camera = Camera(k[0], pose[0])
-    view = mvsnerf.render_view(made, video, camera, 0, config=config, exclude=(0,))
+    space = dataclasses.replace(MVSNERF.space, planes=8)
+    system = dataclasses.replace(MVSNERF, space=space, static=MvsNerf(padding=4), sampler=Ends(4))
+    camera, params = Camera(k[0], pose[0]), Params(None, made, None)
+    shown = lambda video, exclude: novel_view.render_view(
+        params, novel_view.prepare(params, video, system=system), camera, 0, system=system, exclude=exclude
+    )
+    view = shown(video, (0,))
     assert (
         view.colour.shape == (24, 32, 3) and view.depth.shape == (24, 32) and bool(jnp.all(jnp.isfinite(view.colour)))
     )
     images = video.images.copy()
     images[[0, 4]] = 0  # the target itself, and the farthest
-    again = mvsnerf.render_view(made, video._replace(images=images), camera, 0, config=config, exclude=(0,))
+    again = shown(video._replace(images=images), (0,))
     np.testing.assert_array_equal(view.colour, again.colour)
     with pytest.raises(ValueError, match="a view needs 3 source frames, 2 are left"):
-        mvsnerf.render_view(made, video, camera, 0, config=config, exclude=(0, 1, 2))
+        shown(video, (0, 1, 2))

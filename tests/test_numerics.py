@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from oracles import assert_finite, assert_grads_match
 
-from zestjax import numerics
+from zestjax.base import numerics
 
 
 def test_exclusive_sums_and_products_start_with_nothing():

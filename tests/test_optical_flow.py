@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from zestjax.optical_flow import video_flow
+from zestjax.frames.optical_flow import video_flow
 
 
 def texture(height=48, width=64, seed=0):

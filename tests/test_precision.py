@@ -13,30 +13,29 @@ from stage import MINI, PAPER, STILL
 
 from zestjax import cameras, cost_volume, frustum, planesweep, rays, rendering
 from zestjax.apps.weights import at_precision, open_weights
+from zestjax.base.precision import geometry_at, network_at
 from zestjax.novel_view import _maps, render_inputs
-from zestjax.precision import geometry_at, network_at
-from zestjax.presets import preset
 from zestjax.testing.walk import program
 
-at = lambda config, precision: dataclasses.replace(config, precision=precision)
+at = lambda system, precision: dataclasses.replace(system, precision=precision)
 
 
 @functools.cache
-def rendered(config, precision):
+def rendered(system, precision):
     """The view of the stage's inputs, compiled at a precision."""
-    params, (inputs, frames) = stage.params_of(config), stage.inputs_of(config)
-    maps = None
+    params, (inputs, frames) = stage.params_of(system), stage.inputs_of(system)
+    maps, run = None, at(system, precision)
     if params.analysis is not None:
-        evidence = jax.tree.map(lambda x: x[frames], stage.prepared(config).evidence)
-        maps = _maps(params.analysis, evidence, still=not config.dynamic, precision=precision)
-    return render_inputs(params, inputs, maps, config=at(config, precision), rows=4)
+        evidence = jax.tree.map(lambda x: x[frames], stage.prepared(system).evidence)
+        maps = _maps(params.analysis, evidence, system=run)
+    return render_inputs(params, inputs, maps, system=run, rows=4)
 
 
-@pytest.mark.parametrize("config", [MINI, STILL, PAPER], ids=["mini", "still", "paper"])
-def test_a_view_hardly_depends_on_the_precision(config):
-    whole, half = rendered(config, "float32"), rendered(config, "bfloat16")
+@pytest.mark.parametrize("system", [MINI, STILL, PAPER], ids=["mini", "still", "paper"])
+def test_a_view_hardly_depends_on_the_precision(system):
+    whole, half = rendered(system, "float32"), rendered(system, "bfloat16")
     with jax.enable_x64(True):
-        exact = rendered(config, "float64")
+        exact = rendered(system, "float64")
     assert {x.dtype for x in jax.tree.leaves(half)} == {jnp.dtype("float32")}  # what leaves a network is raised
     assert {x.dtype for x in jax.tree.leaves(exact)} == {jnp.dtype("float64")}
     rms = lambda x: np.sqrt(np.mean((np.asarray(x.colour, np.float64) - np.asarray(exact.colour)) ** 2))
@@ -47,7 +46,7 @@ def test_a_view_hardly_depends_on_the_precision(config):
 def test_only_networks_are_in_half_precision():
     """Everything before the first and after the last of a network's layers is float32 at least."""
     params, (inputs, _) = stage.params_of(PAPER), stage.inputs_of(PAPER)
-    fn = lambda p, i: render_inputs(p, i, None, config=at(PAPER, "bfloat16"), rows=4)
+    fn = lambda p, i: render_inputs(p, i, None, system=at(PAPER, "bfloat16"), rows=4)
     closed, _, _ = program(fn, params, inputs)
     halves = [name for name in ("sort", "gather", "scatter-add", "cumsum", "cumprod") if contains_half(closed, name)]
     assert contains_half(closed, "conv_general_dilated") and contains_half(closed, "dot_general")
@@ -94,7 +93,7 @@ def test_float64_is_refused_where_jax_has_it_switched_off():
 
 def test_an_unknown_precision_lists_the_known_ones():
     with pytest.raises(ValueError, match="'float32', 'bfloat16', 'float64'"):
-        preset("tiny", precision="float16")
+        at(MINI, "float16")
     with pytest.raises(ValueError, match="'float32', 'bfloat16', 'float64'"):
         at_precision(open_weights(), "half")
-    assert at_precision(open_weights(), None).config.precision == "float32"
+    assert at_precision(open_weights(), None).system.precision == "float32"

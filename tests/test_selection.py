@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zestjax.selection import RANKS, key_frames, slots
+from zestjax.frames.selection import RANKS, key_frames, slots
 
 LINE = np.stack([np.arange(12.0), np.zeros(12), np.zeros(12)], -1)  # frame i stands at x = i
 

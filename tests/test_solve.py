@@ -9,20 +9,21 @@ import pytest
 from jax.example_libraries import optimizers
 from oracles import adam_by_loop, normal
 
-from zestjax import schedules, solve
-from zestjax.losses.objective import Terms, make_objective
+from zestjax import solve
+from zestjax.losses.objective import make_objective
+from zestjax.train import schedules
 
 X, TRUTH = normal(0, 20, 3), jnp.array([1.0, -2.0, 0.5])
 DATA = {"x": X, "y": X @ TRUTH}
 START = {"w": jnp.zeros(3), "b": jnp.zeros(())}
-MEASURES = Terms(rec=lambda out, batch: jnp.mean((out - batch["y"]) ** 2))
+MEASURES = dict(rec=lambda out, batch: jnp.mean((out - batch["y"]) ** 2))
 
 
 def predict(params, batch):
     return batch["x"] @ params["w"] + params["b"]
 
 
-OBJECTIVE = make_objective(predict, MEASURES, weights=Terms(rec=1.0))
+OBJECTIVE = make_objective(predict, MEASURES, weights=dict(rec=1.0))
 
 
 def many(data, count):
@@ -58,7 +59,7 @@ def test_adam_equals_jaxs_own_to_float_precision():
     step = lambda i, s: update(i, grad(read(s)), s)
     theirs = read(jax.jit(lambda s: jax.lax.fori_loop(0, 300, step, s))(init(START)))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), ours, theirs)
-    assert state.iter_num == 300 and state.skipped == 0 and state.aux.rec < 0.01
+    assert state.iter_num == 300 and state.skipped == 0 and state.aux["rec"] < 0.01
 
 
 def test_adam_runs_from_an_iterator_and_to_a_tolerance():
@@ -128,7 +129,7 @@ def test_adam_without_a_function_says_so():
         solve.Adam(jit=False).update(START, solve.Adam().init_state(START), DATA)
 
 
-WEIGHTS = Terms(rec=1.0)
+WEIGHTS = dict(rec=1.0)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +145,7 @@ WEIGHTS = Terms(rec=1.0)
 def test_every_solver_recovers_the_regression(fit, batch, close):
     found = jax.jit(lambda batch: fit(OBJECTIVE, START, batch, WEIGHTS))(batch)
     np.testing.assert_allclose(found.params["w"], TRUTH, atol=close)
-    assert found.terms.rec < close and found.steps > 1
+    assert found.terms["rec"] < close and found.steps > 1
     assert found.converged == (fit.keywords["tol"] > 0)
 
 

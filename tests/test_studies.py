@@ -26,7 +26,7 @@ def test_a_notebook_runs_as_a_script(path):
     assert run(path, limit=300)  # each prints what it finds
 
 
-@pytest.mark.parametrize("losses", ["frames", "paper"])
+@pytest.mark.parametrize("losses", ["simulated", "paper"])
 def test_two_thousand_steps_over_nasty_scenes_stay_finite(losses, tmp_path):
     run(EXPERIMENTS / "stability.py", "--out", tmp_path, "--losses", losses, "--quiet", limit=1200)
     report = json.loads((tmp_path / "stability.json").read_text())
@@ -34,4 +34,4 @@ def test_two_thousand_steps_over_nasty_scenes_stay_finite(losses, tmp_path):
 
 
 def test_there_is_a_notebook_for_every_topic():
-    assert len(NOTEBOOKS) == 6
+    assert len(NOTEBOOKS) == 8

@@ -106,6 +106,29 @@ def test_norms_by_term_and_group_are_those_of_the_gradient():
     assert "everything is finite" in str(found) and "prior" in str(found)
 
 
+def test_all_terms_are_one_program():
+    traced = []
+
+    def losses(p):
+        traced.append(type(p["b"]))
+        return {str(i): jnp.sum(p["w"] ** i) * (1 + p["b"][i]) for i in range(4)}
+
+    found = explain_gradient(losses, PARAMS)
+    assert len(traced) == 2  # for the names, and for the program
+    w, b = (np.asarray(PARAMS[name], np.float64) for name in ("w", "b"))
+    slopes = [i * np.linalg.norm(w ** max(i - 1, 0)) * abs(1 + b[i]) for i in range(4)]
+    np.testing.assert_allclose(found.norms[:, 1], slopes, rtol=1e-5)
+    np.testing.assert_allclose(found.norms[:, 0], [abs(np.sum(w**i)) for i in range(4)], rtol=1e-5)
+
+
+def test_a_term_is_not_spoilt_by_anothers_infinite_slope():
+    """In one program their gradients meet: 0 times infinity, where only one of them is asked."""
+    losses = lambda x: {"bad": jnp.sum(jnp.sqrt(x)), "good": jnp.sum(3 * x), "worse": jnp.sum(jnp.log(x))}
+    found = explain_gradient(losses, jnp.zeros(4))
+    np.testing.assert_array_equal(np.isfinite(found.norms[:, 0]), [False, True, False])
+    assert found.norms[1, 0] == 6 and found.origin.term == "bad" and found.origin.stage == "gradient"
+
+
 @pytest.mark.parametrize("wrap", [lambda f: f, jax.jit, jax.checkpoint], ids=["plain", "jit", "checkpoint"])
 def test_the_first_operation_that_is_not_finite_is_named_with_its_line(wrap):
     def bad(p):

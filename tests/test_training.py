@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zestjax import training
-from zestjax.training import TrainState
+from zestjax.train import training
+from zestjax.train.training import TrainState
 
 
 def toy_step(params, opt_state, batch):

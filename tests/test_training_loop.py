@@ -17,17 +17,16 @@ from zestjax.apps import clips, producer, run_folder
 from zestjax.apps.log import read_log
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.scenes import digest
-from zestjax.apps.train import TrainOptions, run_metadata, summarise
-from zestjax.apps.weights import SYSTEMS
+from zestjax.apps.train import TrainOptions, run_metadata, run_recipe, summarise
 from zestjax.cameras import Camera
 from zestjax.io.checkpoints import latest_checkpoint
 from zestjax.io.weights import WeightsError, load_weights, save_weights
-from zestjax.presets import preset
 from zestjax.solve import Adam
-from zestjax.training import TrainState, batch_key
+from zestjax.train.recipes import recipe_of
+from zestjax.train.training import TrainState, batch_key
 from zestjax.video import Video
 
-RUN = {"config": {"width": 3}, "seed": 7, "data": "toy"}
+RUN = {"recipe": {"width": 3}, "seed": 7, "data": "toy"}
 
 
 def toy_step(params, opt_state, batch):
@@ -243,10 +242,10 @@ def test_an_error_saves_the_state_that_it_met(tmp_path):
 
 def recipe(**flags):
     """What a run of `zestjax train` stores of its flags."""
-    videos = flags.pop("videos", ())
+    frames = flags.pop("frames", ())
     options = TrainOptions(**{"out": "unused", "preset": "tiny"} | flags)
-    config = preset(options.preset, precision=options.precision, **SYSTEMS[options.system])
-    return run_metadata(config, options, videos)
+    whole = recipe_of(options.preset, system=options.system, precision=options.precision)
+    return run_metadata(run_recipe(whole, options), options, frames)
 
 
 def resumed(out, metadata):
@@ -268,12 +267,13 @@ def begun(tmp_path_factory):
 @pytest.mark.parametrize(
     "said, flags",
     {
-        "peak": {"peak": 1e-3}, "stage": {"stage": "views"}, "seed": {"seed": 1}, "start": {"weights": None},
-        "analysis": {"analysis": "second/weights.safetensors"}, r"config \(precision\)": {"precision": "bfloat16"},
-        r"config \(.*height.*\)": {"preset": "small"}, r"config \(motion\)": {"system": "zest-geometry"},
-        r"data \(scenes\)": {"videos": (np.ones(3), np.ones(3))},
+        r"recipe \(rate\)": {"peak": 1e-3}, r"recipe \(weights\)": {"stage": "views"},
+        "seed": {"seed": 1}, "start": {"weights": None},
+        "analysis": {"analysis": "second/weights.safetensors"}, r"recipe \(system\)": {"precision": "bfloat16"},
+        r"recipe \(.*height.*\)": {"preset": "small"}, r"recipe \(system.*\)": {"system": "zest-geometry"},
+        r"data \(scenes\)": {"frames": (np.ones(3), np.ones(3))},
         r"data \(steps_per_clip, window\)": {"window": 8, "steps_per_clip": 2},
-        r"data \(clip_count\) and stage and peak": {"clip_count": 3, "stage": "views", "peak": 1e-3},
+        r"recipe \(rate, weights\) and data \(clip_count\)": {"clip_count": 3, "stage": "views", "peak": 1e-3},
     }.items(),
 )  # fmt: skip
 def test_a_run_resumes_with_its_own_recipe_alone(begun, said, flags):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from oracles import assert_finite
 
-from zestjax import trees
+from zestjax.base import trees
 
 
 class Layer(NamedTuple):

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from oracles import assert_finite, assert_grads_match
 
-from zestjax import cameras, trust
+from zestjax import cameras
 from zestjax.cameras import Camera
-from zestjax.trust import Trust
+from zestjax.frames import trust
+from zestjax.frames.trust import Trust
 
 trusted_at, unproject = jax.jit(trust.trusted_at), jax.jit(cameras.unproject)
 

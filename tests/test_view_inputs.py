@@ -9,16 +9,19 @@ import pytest
 import stage
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
-from stage import MINI, PAPER
+from stage import MINI, PAPER, STILL
 
-from zestjax import inputs, mvsnerf, novel_view
+from zestjax import novel_view
 from zestjax.cameras import Camera, look_at
-from zestjax.inputs import FLIP, check_inputs, check_target
+from zestjax.frames import inputs
+from zestjax.frames.inputs import FLIP, check_inputs, check_target
 from zestjax.io.layouts import select
+from zestjax.systems.mvsnerf import MVSNERF
+from zestjax.systems.presets import TINY
+from zestjax.systems.targets import target_inputs
 from zestjax.video import Video
 
 CAMERA = stage.camera(0.1)
-PUBLISHED = mvsnerf.MvsNerfConfig(planes=8, padding=4, samples=4)
 LAST = stage.FRAMES - 1
 
 
@@ -29,9 +32,8 @@ def nothing_runs(monkeypatch):
     def fail(*args, **kwargs):
         raise AssertionError("computed what should have been refused")
 
-    for module, names in ((novel_view, "footage _maps target_inputs render_inputs"), (mvsnerf, "_render_image")):
-        for name in names.split():
-            monkeypatch.setattr(module, name, fail)
+    for name in ("footage", "_maps", "target_inputs", "render_inputs"):
+        monkeypatch.setattr(novel_view, name, fail)
 
 
 def posed(change):
@@ -110,7 +112,7 @@ TARGETS = [
     *(Bad(bad.what, lambda v, bad=bad: v | {"camera": bad.change(v["camera"])}, bad.words) for bad in MATRICES),
     *(Bad(what, lambda v, c=change: v | {"camera": c(v["camera"])}, words) for what, change, words in [
         ("a plain tuple", tuple, "`camera` should be a `Camera`, got `tuple`"),
-        ("a batch of one", lambda c: jax.tree.map(lambda x: x[None], c), r"`intrinsics` should be \(3 3\), got .*1, 3"),
+        ("a batch of one", lambda c: jax.tree.map(lambda x: x[None], c), r"`camera` is a batch of shape \(1, 4, 4\)"),
         ("OpenGL's axes", posed(lambda p: FLIP @ p), "target camera .* sees nothing .* If its pose is OpenGL's"),
         ("OpenGL's world_from_camera", posed(lambda p: np.linalg.inv(FLIP @ p)), "nothing .*camera_from_opengl_pose"),
         ("a camera far aside", posed(entry(0, 3, value=99)), "target camera .* sees nothing .* towards the scene.$"),
@@ -132,41 +134,36 @@ def params():
     return stage.params_of(MINI)
 
 
-@pytest.fixture(params=["novel_view", "mvsnerf"])
-def system(request, params):
-    """name, prepare, and render_view of (video, camera, time, exclude), of a prepared scene that nobody looks into."""
+@pytest.fixture(params=[MINI, MVSNERF], ids=["zest", "mvsnerf"])
+def system(request):
+    """prepare, and render_view of (video, camera, time, exclude), of a prepared scene that nobody looks into."""
+    params = jax.eval_shape(request.param.init, jax.random.key(0))
+    given = dict(system=request.param)
 
     def render_view(video, camera, time, exclude):
-        if request.param == "mvsnerf":
-            return mvsnerf.render_view(None, video, camera, time, config=PUBLISHED, exclude=exclude)
         prepared = novel_view.Prepared(video, None, "maps")
-        return novel_view.render_view(params, prepared, camera, time, config=MINI, exclude=exclude)
+        return novel_view.render_view(params, prepared, camera, time, exclude=exclude, **given)
 
-    prepare = novel_view.prepare if request.param == "novel_view" else mvsnerf.prepare
-    given = (params, MINI) if request.param == "novel_view" else (None, PUBLISHED)
-    return request.param, lambda video, **k: prepare(given[0], video, config=given[1], **k), render_view
+    return lambda video, **k: novel_view.prepare(params, video, **given, **k), render_view
 
 
 @pytest.mark.parametrize("bad", VIDEOS, ids=lambda bad: bad.what)
 @pytest.mark.parametrize("host", [True, False], ids=["numpy", "jax"])
 def test_a_video_is_refused_by_its_fault(system, bad, host):
-    name, prepare, render_view = system
+    prepare, _ = system
     video = bad.change(stage.video())
     video = video if host else jax.tree.map(jnp.asarray, video)
-    with pytest.raises(ValueError, match=f"^{name}.prepare: .*{bad.words}"):
+    with pytest.raises(ValueError, match=f"^novel_view.prepare: .*{bad.words}"):
         prepare(video)
-    if name == "mvsnerf":  # its scenes need no preparing
-        with pytest.raises(ValueError, match=f"^mvsnerf.render_view: .*{bad.words}"):
-            render_view(video, CAMERA, 2, ())
 
 
 @pytest.mark.parametrize("bad", TARGETS, ids=lambda bad: bad.what)
 def test_a_target_is_refused_by_its_fault(system, bad):
-    name, _, render_view = system
+    _, render_view = system
     asked = dict(camera=CAMERA, time=2, exclude=())
     with pytest.raises(AssertionError, match="computed"):
         render_view(stage.video(), **asked)
-    with pytest.raises(ValueError, match=f"^{name}.render_view: .*{bad.words}"):
+    with pytest.raises(ValueError, match=f"^novel_view.render_view: .*{bad.words}"):
         render_view(stage.video(), **bad.change(asked))
 
 
@@ -175,53 +172,46 @@ def test_integers_of_any_kind_are_times_and_frames_to_exclude(system, time):
     asked = jax.tree.map(jnp.asarray, CAMERA), time
     for exclude in ((), [np.int32(1), 1], np.array([1, 3]), jnp.array([0]), {4}):
         with pytest.raises(AssertionError, match="computed"):
-            system[2](stage.video(), *asked, exclude)
+            system[1](stage.video(), *asked, exclude)
 
 
 def test_what_is_to_be_excluded_is_checked_when_preparing(system):
-    with pytest.raises(ValueError, match=f"^{system[0]}.prepare: `exclude` holds 6, expected an integer from 0 to 5"):
-        system[1](stage.video(), exclude=(6,))
+    with pytest.raises(ValueError, match="^novel_view.prepare: `exclude` holds 6, expected an integer from 0 to 5"):
+        system[0](stage.video(), exclude=(6,))
 
 
-def test_traced_arguments_are_named(system):
-    name, prepare, render_view = system
-    with pytest.raises(ValueError, match=f"^{name}.render_view: `camera` is traced, expected an array with values"):
-        jax.jit(lambda camera: render_view(stage.video(), camera, 2, ()))(CAMERA)
-    with pytest.raises(ValueError, match=f"^{name}.render_view: `time` is traced"):
-        jax.jit(lambda time: render_view(stage.video(), CAMERA, time, ()))(2)
-    with pytest.raises(ValueError, match=f"^{name}.prepare: `video` is traced"):
-        jax.jit(prepare)(stage.video())
+def test_a_traced_video_is_not_prepared(system):
+    with pytest.raises(ValueError, match="^novel_view.prepare: `video` is traced, expected an array with values"):
+        jax.jit(system[0])(stage.video())
 
 
 def test_what_does_not_belong_together_is_named(params):
-    render = lambda prepared, params=params, config=MINI: novel_view.render_view(
-        params, prepared, CAMERA, 2, config=config
-    )
+    render = lambda prepared, params=params: novel_view.render_view(params, prepared, CAMERA, 2, system=MINI)
     with pytest.raises(ValueError, match="`prepared` should be a `Prepared`, got `Video`"):
         render(stage.video())
     with pytest.raises(ValueError, match="`prepared` has no maps of its frames"):
         render(novel_view.Prepared(stage.video(), None, None))
-    lacking = params._replace(motion=None)
+    lacking = params._replace(dynamic=params.dynamic._replace(volume=None))
     for refused in (lambda: render(novel_view.Prepared(stage.video(), None, "maps"), lacking),
-                    lambda: novel_view.prepare(lacking, stage.video(), config=MINI)):  # fmt: skip
-        with pytest.raises(ValueError, match="`params` have no `motion`, which `config` asks for"):
+                    lambda: novel_view.prepare(lacking, stage.video(), system=MINI)):  # fmt: skip
+        with pytest.raises(ValueError, match=r"`params` have no `.dynamic.volume.*`, which `system` computes with"):
             refused()
-    with pytest.raises(ValueError, match="`params` have no `analysis`"):
-        novel_view.prepare(stage.params_of(PAPER), stage.video(), config=MINI)
-    with pytest.raises(ValueError, match="mvsnerf.render_view: `video` should be a `Video`, got `Prepared`"):
-        mvsnerf.render_view(None, novel_view.Prepared(stage.video(), None, None), CAMERA, 2, config=PUBLISHED)
+    with pytest.raises(ValueError, match="`params` have no `.analysis"):
+        novel_view.prepare(stage.params_of(PAPER), stage.video(), system=MINI)
+    with pytest.raises(ValueError, match="`params` have `.dynamic.*`, which `system` lacks"):
+        novel_view.prepare(params, stage.video(), system=STILL)
+    with pytest.raises(ValueError, match=r"`params.analysis.*` has shape .*, expected .*; give its own weights"):
+        novel_view.prepare(params, stage.video(), system=TINY)
 
 
-def test_bytes_are_taken_for_what_they_show(monkeypatch):
+def test_bytes_are_taken_for_what_they_show():
     shown = stage.video()
     quantised = shown._replace(images=np.round(shown.images * 255).astype(np.uint8))
-    monkeypatch.setattr(mvsnerf, "_render_image", lambda params, sources, camera, config: sources)
-    sources = mvsnerf.render_view(None, mvsnerf.prepare(None, quantised, config=PUBLISHED), CAMERA, 2, config=PUBLISHED)
-    exact = mvsnerf.render_view(None, shown, CAMERA, 2, config=PUBLISHED)
-    assert sources.images.dtype == jnp.float32
-    np.testing.assert_allclose(sources.images, exact.images, atol=0.5 / 255 + 1e-6)
+    shown_by = lambda video: target_inputs(*video, CAMERA, 2, system=MVSNERF)[0].key.images
+    assert shown_by(quantised).dtype == jnp.float32
+    np.testing.assert_allclose(shown_by(quantised), shown_by(shown), atol=0.5 / 255 + 1e-6)
     with pytest.raises(AssertionError, match="computed"):
-        novel_view.prepare(stage.params_of(MINI), quantised, config=MINI)
+        novel_view.prepare(stage.params_of(MINI), quantised, system=MINI)
 
 
 def test_a_colour_may_leave_its_range_by_rounding():

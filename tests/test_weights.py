@@ -4,13 +4,14 @@ import jax
 import numpy as np
 
 from zestjax.apps.weights import open_weights, shipped_weights
-from zestjax.presets import preset
+from zestjax.systems import presets
+from zestjax.train.recipes import RECIPES
 
 
 def test_shipped_weights_are_small_finite_and_of_the_preset_they_name():
     model = open_weights()
-    assert model.system == "zest"
-    assert model.config == preset("small")
+    assert model.name == "zest" and model.preset == "small"
+    assert model.system == presets.ZEST and model.recipe == RECIPES["small"]
     assert shipped_weights().stat().st_size < 8e6
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(model.params))
 

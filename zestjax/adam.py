@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.numerics import safe_sqrt
-from zestjax.trees import all_finite, tree_cast, tree_norm
+from zestjax.base.numerics import safe_sqrt
+from zestjax.base.trees import all_finite, tree_cast, tree_norm
 
 
 class AdamState(NamedTuple):

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.checks import check_shapes
-from zestjax.numerics import matmul, matvec, safe_norm
+from zestjax.base.checks import check_shapes
+from zestjax.base.numerics import matmul, matvec, safe_norm
 
 NEAREST_DEPTH = 1e-6
 

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from zestjax.checks import check_shapes
-from zestjax.numerics import matvec
+from zestjax.base.checks import check_shapes
+from zestjax.base.numerics import matvec
 from zestjax.plane_statistics import CostVolume, Sweep, plane_statistics
 from zestjax.planesweep import sweep_grid, warp
 from zestjax.resample import bilinear

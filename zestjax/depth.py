@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
 
 EMPTY = 1e-6  # opacity to which a ray's depth is that of what lies behind it
 FLAT = 1e-3  # mean absolute deviation, as a share of the median, under which a depth map is flat

@@ -12,14 +12,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.checks import check_shapes
 from zestjax.cameras import Camera
-from zestjax.checks import check_shapes
 from zestjax.cost_volume import cost_volume
+from zestjax.frames.trust import Trust, agreement
 from zestjax.nets.cost_regulariser import CostRegulariser, cost_regulariser, init_cost_regulariser
 from zestjax.nets.feature_pyramid import FeaturePyramid, init_feature_pyramid
 from zestjax.nets.layers import Dense, dense, init_dense, raised
 from zestjax.planesweep import carry, homographies, sweep_grid
-from zestjax.trust import Trust, agreement
 
 TRUST_MAPS = 3
 CELL_COLOURS = 12  # the four half-resolution pixels of a cell

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.checks import check_shapes
 from zestjax.cameras import project
-from zestjax.checks import check_shapes
 
 EMPTY = 1e-4  # opacity under which a ray shows too little to have an expected point
 

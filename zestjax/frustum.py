@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from zestjax.base.checks import check_option, check_shapes
 from zestjax.cameras import Camera, project, unproject
-from zestjax.checks import check_option, check_shapes
 from zestjax.rays import SPACINGS
 
 NEAREST = 1e-3  # of near (far): the closest (1 / the farthest) depth that the inverse spacing tells apart
@@ -24,8 +25,8 @@ class Frustum(NamedTuple):
     """camera: one `Camera`. near, far: () world units, 0 < near < far. height, width: of the camera's image, pixels."""
 
     camera: Camera
-    near: jax.Array
-    far: jax.Array
+    near: jax.Array | np.floating
+    far: jax.Array | np.floating
     height: int
     width: int
 

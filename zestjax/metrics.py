@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.checks import check_shapes
-from zestjax.numerics import safe_norm
+from zestjax.base.checks import check_shapes
+from zestjax.base.numerics import safe_norm
 
 PSNR_CAP = 100.0
 """dB given to identical images, whose PSNR is infinite: no 8-bit image that differs at all reaches it."""

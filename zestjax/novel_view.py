@@ -12,24 +12,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.analysis import FrameMaps, frame_maps
-from zestjax.assembly import Footage, dequantised, footage, target_inputs, video_evidence
+from zestjax.base.checks import check_known, check_types, traced
+from zestjax.base.precision import geometry_at, network_at
 from zestjax.cameras import project
-from zestjax.checks import check_types
-from zestjax.frustum import world_from_frustum
-from zestjax.inputs import check_exclude, check_inputs, check_view
-from zestjax.model import encode
-from zestjax.precision import geometry_at, network_at
-from zestjax.prediction import render_rays
+from zestjax.frames.analysis import FrameMaps
+from zestjax.frames.assembly import Footage, dequantised, footage, video_evidence
+from zestjax.frames.inputs import check_exclude, check_inputs, check_view
 from zestjax.rays import pixel_grid
-from zestjax.video import Video
+from zestjax.systems.system import Params, System
+from zestjax.systems.targets import target_inputs
+from zestjax.video import Inputs, Video
 
-BLOCK_ROWS = 8  # rows rendered together: memory does not grow with the image
+BLOCK_ROWS = 8  # at most so many rows are rendered together, so that memory does not grow with the image
+BLOCK_POINTS = 2**16  # and at most so many samples, unless a ray has more: the caches hold what they are computed from
 
 
 class Prepared(NamedTuple):
     """A scene's cache. video: `Video` on the host. footage: `assembly.Footage`, and maps: `FrameMaps` of every frame;
-    None with an encoder that has none."""
+    None in a system that asks nothing of single frames."""
 
     video: Video
     footage: Footage | None
@@ -50,29 +50,31 @@ class View(NamedTuple):
     flow: jax.Array | None
 
 
-@functools.partial(jax.jit, static_argnames=("still", "precision"))
-def _maps(params, evidence, *, still, precision):
-    evidence = geometry_at(precision, dequantised(evidence))
-    return frame_maps(network_at(precision, params), evidence, still=still)
+@functools.partial(jax.jit, static_argnames=("system",))
+def _maps(params, evidence, *, system: System):
+    assert system.frames is not None
+    evidence = geometry_at(system.precision, dequantised(evidence))
+    return system.frames(network_at(system.precision, params), evidence, still=system.dynamic is None)
 
 
-def _frame_maps(params, seen, video, config, *, frames=None, exclude=()):
+def _frame_maps(params, seen, video, system, *, frames=None, exclude=()):
     """`FrameMaps` of all frames or of those named, whose evidence is found once each."""
     used, place = (None, None) if frames is None else np.unique(frames, return_inverse=True)
-    evidence = video_evidence(
-        seen, video.cameras, video.near, video.far, planes=config.evidence_planes, frames=used, exclude=exclude
-    )
+    with jax.ensure_compile_time_eval():  # the frames are known also where a camera is traced
+        evidence = video_evidence(
+            seen, video.cameras, video.near, video.far, planes=system.frames.planes, frames=used, exclude=exclude
+        )
     evidence = evidence if place is None else jax.tree.map(lambda x: x[place], evidence)
-    return _maps(params.analysis, evidence, still=not config.dynamic, precision=config.precision)
+    return _maps(params.analysis, evidence, system=system)
 
 
-def prepare(params, video, *, config, exclude=()):
+def prepare(params: Params, video: Video, *, system: System, exclude=()) -> Prepared:
     """What a scene is asked for every view: each frame's own depth and moving pixels.
 
     Args:
-      params: `model.ZestParams`.
+      params: of the system.
       video: `Video`, whose images may be uint8.
-      config: `presets.Config`.
+      system: `System`.
       exclude: see the header.
 
     Returns:
@@ -80,103 +82,132 @@ def prepare(params, video, *, config, exclude=()):
 
     Raises:
       ValueError: before anything is compiled, if no view can be predicted from the video (see `inputs.check_inputs`), a
-        frame to exclude is not in it, or `params` lack what `config` computes.
+        frame to exclude is not in it, or `params` are not those of the system.
     """
     video = check_inputs("novel_view.prepare", video, quantised=True)
     exclude = check_exclude("novel_view.prepare", len(video.images), exclude)
-    _check_params("novel_view.prepare", params, config)
-    if params.analysis is None:
+    check_params("novel_view.prepare", params, system)
+    if system.frames is None:
         return Prepared(video, None, None)
     seen = footage(video.images)
-    return Prepared(video, seen, _frame_maps(params, seen, video, config, exclude=exclude))
+    return Prepared(video, seen, _frame_maps(params, seen, video, system, exclude=exclude))
 
 
-def _check_params(where, params, config):
-    """Refuse parameters without a part that the configuration computes."""
-    parts = dict(
-        analysis=config.analysed, geometry=config.geometry, motion=config.motion_volume, dynamic=config.dynamic
-    )
-    if lacking := [name for name, needed in parts.items() if needed and getattr(params, name) is None]:
-        raise ValueError(
-            f"{where}: `params` have no `{lacking[0]}`, which `config` asks for; give the configuration of the weights."
-        )
+@functools.lru_cache(maxsize=64)
+def _structure(system):
+    """[(path, shape)] of a system's parameters."""
+    shapes = jax.eval_shape(system.init, jax.random.key(0))
+    return [(jax.tree_util.keystr(path), leaf.shape) for path, leaf in jax.tree_util.tree_leaves_with_path(shapes)]
 
 
-def render_view(params, prepared, camera, time, *, config, exclude=()):
-    """A view from a camera at a time of the video.
+def check_params(where: str, params: Params, system: System) -> None:
+    """Refuse parameters that are not those of a system.
+
+    Raises:
+      ValueError: naming the first that is missing, not wanted, or of another shape.
+    """
+    have = {jax.tree_util.keystr(path): np.shape(x) for path, x in jax.tree_util.tree_leaves_with_path(params)}
+    want = dict(_structure(system))
+    for path, shape in want.items():
+        if path not in have:
+            raise ValueError(f"{where}: `params` have no `{path}`, which `system` computes with; give its own weights.")
+        if have[path] != shape:
+            raise ValueError(f"{where}: `params{path}` has shape {have[path]}, expected {shape}; give its own weights.")
+    if more := [path for path in have if path not in want]:
+        raise ValueError(f"{where}: `params` have `{more[0]}`, which `system` lacks; give the weights' own system.")
+
+
+def render_view(params: Params, prepared: Prepared, camera, time, *, system: System, exclude=()) -> View:
+    """A view from a camera at a time of the video; pure after `prepare`, for `jit`, `vmap` over cameras and times, and
+    `grad` (which frames serve, and where guided rays are sampled, is held).
 
     Args:
-      params: `model.ZestParams`.
+      params: of the system.
       prepared: `Prepared` of the video.
       camera: `Camera` for an image of the video's size.
       time: int frame time.
-      config: `presets.Config`.
+      system: `System`.
       exclude: see the header; their traces in the other frames' maps are removed too.
 
     Returns:
       `View`.
 
     Raises:
-      ValueError: before anything is compiled, if the video cannot give the view (see `inputs.check_view`), or `params`
-        lack what `config` computes or `prepared` what they need.
+      ValueError: before anything is compiled, if the video cannot give the view (see `inputs.check_view`), `params`
+        are not those of the system, `prepared` lacks what it needs, or is traced where frames are to be excluded.
     """
     where = "novel_view.render_view"
     check_types(where, prepared=(prepared, Prepared))
-    _check_params(where, params, config)
+    check_params(where, params, system)
     video, maps = prepared.video, prepared.maps
-    if maps is None and params.analysis is not None:
-        raise ValueError(f"{where}: `prepared` has no maps of its frames; prepare the video with the same `params`.")
+    if maps is None and system.frames is not None:
+        raise ValueError(f"{where}: `prepared` has no maps of its frames; prepare the video with the same `system`.")
     time, exclude = check_view(where, video, camera, time, exclude=exclude)
     inputs, frames = target_inputs(
-        video.images, video.cameras, video.near, video.far, camera, time, config=config, exclude=exclude
+        video.images, video.cameras, video.near, video.far, camera, time, system=system, exclude=exclude
     )
-    if maps is not None and exclude:
-        maps = _frame_maps(params, prepared.footage, video, config, frames=frames, exclude=exclude)
-    elif maps is not None:
+    if system.frames is None:
+        maps = None
+    elif exclude and traced(frames):  # which frames serve is not known: the evidence of all is found without those
+        check_known(where, prepared=prepared)
+        maps = _frame_maps(params, prepared.footage, video, system, exclude=exclude)
         maps = jax.tree.map(lambda x: x[frames], maps)
-    return render_inputs(params, inputs, maps, config=config)
+    elif exclude:
+        maps = _frame_maps(params, prepared.footage, video, system, frames=frames, exclude=exclude)
+    else:
+        maps = jax.tree.map(lambda x: x[frames], maps)
+    return render_inputs(params, inputs, maps, system=system)
 
 
-@functools.partial(jax.jit, static_argnames=("config", "rows"))
-def render_inputs(params, inputs, maps, *, config, rows=None):
-    """The view of given inputs; a pure function, compiled once for a size and a configuration.
+@functools.partial(jax.jit, static_argnames=("system", "rows"))
+def render_inputs(params: Params, inputs: Inputs, maps: FrameMaps | None, *, system: System, rows=None) -> View:
+    """The view of given inputs; a pure function, compiled once for a size and a system.
 
     Args:
-      params: `model.ZestParams`.
-      inputs: `model.Inputs`.
+      params: of the system.
+      inputs: `Inputs`.
       maps: `FrameMaps` of the inputs' frames, or None.
-      config: `presets.Config`.
+      system: `System`.
       rows: how many of the first rows to render, all by default.
 
     Returns:
       `View`.
     """
-    params = network_at(config.precision, params)
-    inputs, maps = geometry_at(config.precision, (inputs, maps))
-    encoding = encode(params, inputs, maps, config=config)
+    params = network_at(system.precision, params)
+    inputs, maps = geometry_at(system.precision, (inputs, maps))
+    scene = system.encode(params, inputs, maps)
     height, width = inputs.key.images.shape[1:3]
     height = height if rows is None else rows
-    together = min(BLOCK_ROWS, height)
-    blocks = -(-height // together)
-    pixels = pixel_grid(blocks * together, width, dtype=inputs.key.images.dtype).reshape(blocks, -1, 2)
-    block = lambda p: _view_block(render_rays(params, encoding, inputs, p, config=config), encoding, inputs, p, config)
-    image = lambda x: x.reshape(blocks * together, width, *x.shape[2:])[:height]
+    count, together = height * width, _together(system, scene, inputs, height)
+    pixels = pixel_grid(height, width, dtype=inputs.key.images.dtype).reshape(-1, 2)
+    blocks = -(-count // together)
+    pixels = jnp.pad(pixels, [(0, blocks * together - count), (0, 0)], mode="edge").reshape(blocks, together, 2)
+    block = lambda p: _view_block(system, system.render(params, scene, inputs, p), scene, inputs)
+    image = lambda x: x.reshape(blocks * together, *x.shape[2:])[:count].reshape(height, width, *x.shape[2:])
     view = jax.tree.map(image, jax.lax.map(block, pixels))
     shown = lambda x: None if x is None else jnp.clip(x, 0, 1)
     images = {name: shown(getattr(view, name)) for name in ("colour", "static", "dynamic", "opacity")}
     return view._replace(**images)
 
 
-def _view_block(prediction, encoding, inputs, pixels, config):
+def _together(system, scene, inputs, height):
+    """Rays rendered together: whole rows, or fewer where a ray has many samples."""
+    width, one = inputs.key.images.shape[2], jnp.zeros((1, 2), inputs.key.images.dtype)
+    sampled = lambda scene, pixels: system.sampler.fractions(scene.guides, pixels, None)
+    samples = jax.eval_shape(sampled, scene, one).shape[1]
+    return max(1, min(min(BLOCK_ROWS, height) * width, BLOCK_POINTS // samples))
+
+
+def _view_block(system, prediction, scene, inputs):
     p = prediction
-    flow = None if p.dynamic is None else _optical_flow(p, encoding.frustum, inputs.camera, pixels, config)
+    flow = None if p.dynamic is None else _optical_flow(p, system.place(scene, inputs), inputs.camera)
     return View(p.colour, p.static_colour, p.dynamic_colour, p.depth, p.opacity, p.dynamicness, flow)
 
 
-def _optical_flow(prediction, frustum, camera, pixels, config):
+def _optical_flow(prediction, place, camera):
     """(R, 2) pixels by which the rays' expected points move until the next time; what is static stays."""
     marched = prediction.marched
-    moved = world_from_frustum(frustum, marched.coords + prediction.dynamic.flow_forward, spacing=config.spacing)
+    moved = place.world(marched.coords + prediction.dynamic.flow_forward)
     flow = jnp.sum(prediction.dynamic_weights[..., None] * (moved - marched.points), axis=1)
     total = jnp.maximum(jnp.sum(prediction.weights, axis=1, keepdims=True), 1e-6)
     point = jnp.sum(prediction.weights[..., None] * marched.points, axis=1) / total

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
+from zestjax.frames.trust import trusted
 from zestjax.planesweep import carry
 from zestjax.resample import bilinear_cells, corner_offsets, gather_corners, interpolate
-from zestjax.trust import trusted
 
 
 class CostVolume(NamedTuple):

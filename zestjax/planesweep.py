@@ -9,9 +9,9 @@ grid          (h, w, 3) homogeneous reference pixels (u, v, 1)
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.checks import check_shapes
+from zestjax.base.numerics import matmul, matvec
 from zestjax.cameras import NEAREST_DEPTH, intrinsics_inverse, relative
-from zestjax.checks import check_shapes
-from zestjax.numerics import matmul, matvec
 from zestjax.rays import pixel_grid, regular_depths
 from zestjax.resample import bilinear
 

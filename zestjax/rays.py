@@ -11,9 +11,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.checks import check_option, check_shapes
+from zestjax.base.numerics import matvec
 from zestjax.cameras import centre, intrinsics_inverse
-from zestjax.checks import check_option, check_shapes
-from zestjax.numerics import matvec
 
 SPACINGS = ("depth", "inverse")
 

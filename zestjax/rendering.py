@@ -18,9 +18,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.checks import check_option, check_shapes
+from zestjax.base.checks import check_option, check_shapes
+from zestjax.base.numerics import exclusive_cumprod, exclusive_cumsum
 from zestjax.depth import expected_depth
-from zestjax.numerics import exclusive_cumprod, exclusive_cumsum
 
 BLEND_FORMS = ("opacity", "density")
 

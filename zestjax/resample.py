@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.checks import check_option, check_shapes
+from zestjax.base.checks import check_option, check_shapes
 
 EDGE = 1e-3  # pixels: rounding of a float32 homography; a point this far outside still counts as on the border
 

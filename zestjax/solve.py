@@ -5,7 +5,10 @@ The one module that imports jaxopt, which is no longer developed: the way out st
     objective   `objective(params, batch, weights) -> (total, terms)`, from `losses.objective.make_objective`
     params      tree of float arrays
     batch       tree, passed through
-    weights     `Terms`; Python numbers stay static, so that a weight of 0 keeps its term out of the program
+    weights     by term; Python numbers stay static, so that a weight of 0 keeps its term out of the program
+
+jaxopt's solvers are given one flat vector, and, outside of `jit` and `vmap`, a compiled gradient that their own loop
+calls: they ask for it at many places, and a compiled loop would hold, and compile, one copy of the model for each.
 """
 
 import dataclasses
@@ -18,8 +21,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from zestjax.adam import adam, init_adam
-from zestjax.checks import check_option
-from zestjax.trees import tree_norm
+from zestjax.base.checks import check_option, traced
+from zestjax.base.trees import tree_norm
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "JAXopt is no longer", DeprecationWarning)
@@ -28,10 +31,11 @@ with warnings.catch_warnings():
 
 
 class Fit(NamedTuple):
-    """params: like the initial ones. terms, grad_norm (() L2): at them, or at the last batch before the last step.
-    steps: () int. converged: () bool, that the solver's own stopping measure came down to tol."""
+    """params: like the initial ones. total, terms, grad_norm (() L2): at them, or at the last batch before the last
+    step. steps: () int. converged: () bool, that the solver's own stopping measure came down to tol."""
 
     params: Any
+    total: jax.Array
     terms: Any
     grad_norm: jax.Array
     steps: jax.Array
@@ -157,17 +161,8 @@ def fit_lbfgs(objective, params, batch, weights, *, max_steps=100, tol=1e-4, his
       ValueError: if `linesearch` is unknown.
     """
     check_option("fit_lbfgs", linesearch=(linesearch, ("backtracking", "zoom", "hager-zhang")))
-    solver = jaxopt.LBFGS(
-        fun=lambda p, data: objective(p, data, weights),
-        has_aux=True,
-        maxiter=max_steps,
-        tol=tol,
-        history_size=history,
-        linesearch=linesearch,
-        implicit_diff=False,
-        unroll=False,
-    )
-    return _run(solver, params, batch, tol)
+    options = dict(maxiter=max_steps, tol=tol, history_size=history, linesearch=linesearch)
+    return _run(jaxopt.LBFGS, options, objective, params, batch, weights)
 
 
 def fit_gradient(objective, params, batch, weights, *, max_steps=500, tol=1e-4, stepsize=0.0, acceleration=True):
@@ -186,17 +181,8 @@ def fit_gradient(objective, params, batch, weights, *, max_steps=500, tol=1e-4, 
     Returns:
       `Fit`; not differentiable in reverse.
     """
-    solver = jaxopt.GradientDescent(
-        fun=lambda p, data: objective(p, data, weights),
-        has_aux=True,
-        maxiter=max_steps,
-        tol=tol,
-        stepsize=stepsize,
-        acceleration=acceleration,
-        implicit_diff=False,
-        unroll=False,
-    )
-    return _run(solver, params, batch, tol)
+    options = dict(maxiter=max_steps, tol=tol, stepsize=stepsize, acceleration=acceleration)
+    return _run(jaxopt.GradientDescent, options, objective, params, batch, weights)
 
 
 def fit_adam(objective, params, batches, weights, *, learning_rate=5e-4, clip_norm=1.0, tol=0.0):
@@ -252,7 +238,7 @@ def fit_least_squares(residual, params, *args, method="levenberg_marquardt", max
       tol: stop at this L2 gradient norm.
 
     Returns:
-      `Fit`; `terms` is the residual at the end.
+      `Fit`; `terms` is the residual at the end, `total` the sum of its squares.
 
     Raises:
       ValueError: if `method` is unknown.
@@ -273,14 +259,36 @@ def fit_least_squares(residual, params, *args, method="levenberg_marquardt", max
             solver = jaxopt.GaussNewton(**options)
         flat, state = solver.run(flat)
     at_end, pullback = jax.vjp(options["residual_fun"], flat)
-    return Fit(unravel(flat), at_end, tree_norm(pullback(at_end)[0]), state.iter_num, state.error <= tol)
+    return Fit(
+        unravel(flat), jnp.sum(at_end**2), at_end, tree_norm(pullback(at_end)[0]), state.iter_num, state.error <= tol
+    )
 
 
-def _run(solver, params, batch, tol):
-    """A jaxopt solver run on one batch, as a `Fit`."""
-    params, state = solver.run(params, batch)
-    grads, terms = jax.grad(solver.fun, has_aux=True)(params, batch)
-    return Fit(params, terms, tree_norm(grads), state.iter_num, state.error <= tol)
+def _run(kind, options, objective, params, batch, weights):
+    """A jaxopt solver of a kind run on one batch, as a `Fit`."""
+    flat, unravel = ravel_pytree(params)
+    gradient = jax.value_and_grad(lambda x, data: objective(unravel(x), data, weights), has_aux=True)
+    shared = dict(value_and_grad=True, implicit_diff=False, **options)
+    plain = lambda x, data: (lambda out: (out[0][0], out[1]))(gradient(x, data))  # jaxopt mixes up terms of its own
+    if traced((params, batch, weights)):
+        flat, state = kind(fun=plain, jit=True, unroll=False, **shared).run(flat, batch)
+    else:
+        gradient = _compiled(gradient, flat, batch)
+        with jax.disable_jit():  # of the loops and branches that jaxopt puts around it
+            flat, state = kind(fun=plain, jit=False, unroll=True, **shared).run(flat, batch)
+    (total, terms), grads = gradient(flat, batch)
+    return Fit(unravel(flat), total, terms, tree_norm(grads), state.iter_num, state.error <= options["tol"])
+
+
+def _compiled(fn, *args):
+    """The function compiled for arguments like these, also where `jit` is disabled."""
+    compiled = jax.jit(fn).lower(*args).compile()
+
+    def call(*args):
+        with jax.disable_jit(False):
+            return compiled(*args)
+
+    return call
 
 
 def _pass(solver, params, batches, tol):
@@ -288,4 +296,4 @@ def _pass(solver, params, batches, tol):
     first = jax.tree.map(lambda x: x[0], batches)
     start = (params, solver.init_state(params, first))
     (params, state), _ = jax.lax.scan(lambda carry, data: (tuple(solver.update(*carry, data)), None), start, batches)
-    return Fit(params, state.aux, state.error, state.iter_num, state.error <= tol)
+    return Fit(params, state.value, state.aux, state.error, state.iter_num, state.error <= tol)

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from zestjax.base.checks import check_known, check_shapes, check_types
 from zestjax.cameras import Camera, check_bounds, check_camera
-from zestjax.checks import check_known, check_shapes, check_types
 
 ROUNDING = 1e-4  # by which a colour may leave [0, 1]: a resize exceeds it by its sums' rounding, and no eye sees it
 
@@ -23,6 +23,30 @@ class Video(NamedTuple):
     cameras: Camera
     near: jax.Array
     far: jax.Array
+
+
+class Frames(NamedTuple):
+    """Frames of a video that serve a target. images: (V, H, W, 3). cameras: `Camera` (V, ...). valid: (V,) 1, or 0 of
+    what is not there and only fills its place. times: (V,) frame times."""
+
+    images: jax.Array
+    cameras: Camera
+    valid: jax.Array
+    times: jax.Array
+
+
+class Inputs(NamedTuple):
+    """All that a view is predicted from. key, slots: `Frames` of the static and of the dynamic field, slots None where
+    there is no dynamic field. camera: the target's `Camera`, of the images' size. time: () target frame time.
+    duration: () frames of the video. near, far: () world units."""
+
+    key: Frames
+    slots: Frames | None
+    camera: Camera
+    time: jax.Array | np.floating
+    duration: jax.Array | np.floating
+    near: jax.Array | np.floating
+    far: jax.Array | np.floating
 
 
 def check_video(where, video, *, quantised=False):

@@ -28,53 +28,55 @@ def measure(name, repeats, fused):
     import model as stages
     import numpy as np
 
-    from zestjax import batches, learn, novel_view
+    from zestjax import novel_view
     from zestjax.apps.weights import open_weights
-    from zestjax.backend import sum_error
+    from zestjax.base.backend import sum_error
     from zestjax.cameras import Camera
-    from zestjax.model import init_params, volumes
-    from zestjax.presets import preset
+    from zestjax.systems.targets import target_inputs
+    from zestjax.train import batches
+    from zestjax.train.recipes import RECIPES
     from zestjax.video import Video
 
-    config, key = preset(name), jax.random.key
-    clip: Any = stages.noise_clip(config)
-    params = open_weights().params if name == "small" else init_params(key(2), config)
+    recipe, key = RECIPES[name], jax.random.key
+    system: Any = recipe.system
+    clip: Any = stages.noise_clip(recipe)
+    params = open_weights().params if name == "small" else system.init(key(2))
     cameras = Camera(clip.intrinsics, clip.camera_from_world)
     images: Any = clip.images.astype(np.float32) / 255
     video = Video(images, cameras, clip.near, clip.far)
     target = Camera(*(x[3] for x in cameras))
-    prepare = lambda: novel_view.prepare(params, video, config=config)
-    inputs, frames = novel_view.target_inputs(video.images, cameras, clip.near, clip.far, target, 5, config=config)
+    prepare = lambda: novel_view.prepare(params, video, system=system)
+    inputs, frames = target_inputs(video.images, cameras, clip.near, clip.far, target, 5, system=system)
     maps = jax.tree.map(lambda x: x[frames], prepare().maps)
-    swept = jax.jit(lambda p, i, m: volumes(p, i, m, config=config))
-    step = jax.jit(learn.step_gradients(config))
-    batch = batches.batch_from_clip(key(1), batches.prepare_clip(key(0), clip, config), config)
+    encode = jax.jit(system.encode)
+    step = jax.jit(jax.value_and_grad(recipe.objective(), has_aux=True))
+    batch = batches.batch_from_clip(key(1), batches.prepare_clip(key(0), clip, system), recipe)
     calls = {
         "prepare, s": prepare,
-        "volumes, s": lambda: swept(params, inputs, maps),
-        "frame, s": lambda: novel_view.render_inputs(params, inputs, maps, config=config),
+        "volumes, s": lambda: encode(params, inputs, maps),
+        "frame, s": lambda: novel_view.render_inputs(params, inputs, maps, system=system),
         "training step, s": lambda: step(params, batch),
     }
     found = {what: stages.timed(call, repeats)["best"] for what, call in calls.items()}
     wide = lambda x: np.asarray(x, np.float64)
-    ours, theirs = (wide(found_at(params, batch, config, precision)) for precision in ("float32", "float64"))
+    ours, theirs = (wide(found_at(params, batch, system, precision)) for precision in ("float32", "float64"))
     found["frames' logits, median error"] = float(np.median(np.abs(ours - theirs)) / np.sqrt(np.mean(theirs**2)))
     found["mapped sum of 40,000 rows, error"] = sum_error()
     return found
 
 
-def found_at(params, batch, config, precision):
+def found_at(params, batch, system, precision):
     """The planes' logits of the frames' own analysis at a precision."""
-    import dataclasses
-
     import jax
 
-    from zestjax import learn
+    from zestjax.base.precision import geometry_at, network_at
+    from zestjax.frames.assembly import dequantised
+
+    def logits(params, evidence):
+        return system.frames(network_at(precision, params), geometry_at(precision, dequantised(evidence))).logits
 
     with jax.enable_x64(precision == "float64"):
-        config = dataclasses.replace(config, precision=precision)
-        maps: Any = jax.jit(lambda p, b: learn._analysed(p, b, config))(params.analysis, batch)
-        return jax.device_get(maps.logits)
+        return jax.device_get(jax.jit(logits)(params.analysis, batch.evidence))
 
 
 def main():

@@ -15,18 +15,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax import batches, learn, model, novel_view
+from zestjax import novel_view
 from zestjax.apps.memory import peak_megabytes, reset_peak
 from zestjax.cameras import Camera
-from zestjax.losses.objective import PAPER_WEIGHTS
-from zestjax.presets import preset
 from zestjax.simulate.clips import Clip
+from zestjax.systems.targets import target_inputs
+from zestjax.train import batches
+from zestjax.train.recipes import RECIPES
 from zestjax.video import Video
 
 
-def noise_clip(config, frames=12, targets=2):
+def noise_clip(recipe, frames=12, targets=2):
     """A `Clip` of noise from cameras 0.1 apart, depths between 2 and 8."""
-    draw, size = np.random.default_rng(0), (config.height, config.width)
+    draw, size = np.random.default_rng(0), (recipe.height, recipe.width)
     times = np.arange(targets, dtype=np.int32) + 4
     image = lambda n: draw.integers(0, 256, (n, *size, 3), np.uint8)
     depth = lambda n: draw.uniform(2, 8, (n, *size)).astype(np.float32)
@@ -74,37 +75,36 @@ def flops(compiled):
     return (compiled.cost_analysis() or {}).get("flops")
 
 
-def measure_step(config, clip, repeats):
-    """One training step: with the paper's losses for its encoder, with the shipped weights' otherwise."""
-    weights = PAPER_WEIGHTS if config.encoder == "pyramid" else learn.FRAME_WEIGHTS
-    init, step = learn.make_train_step(config, steps=1000, weights=weights)
-    prepared = batches.prepare_clip(jax.random.key(0), clip, config)
-    batch = batches.batch_from_clip(jax.random.key(1), prepared, config)
-    params = model.init_params(jax.random.key(2), config)
+def measure_step(recipe, clip, repeats):
+    """One training step of a recipe."""
+    init, step = recipe.trainer(steps=1000)
+    prepared = batches.prepare_clip(jax.random.key(0), clip, recipe.system)
+    batch = batches.batch_from_clip(jax.random.key(1), prepared, recipe)
+    params = recipe.system.init(jax.random.key(2))
     state = [params, init(params)]
     start = time.perf_counter()
-    compiled = step.lower(*state, batch).compile()
+    compiled = jax.jit(step, donate_argnums=(0, 1)).lower(*state, batch).compile()
     seconds = time.perf_counter() - start
 
     def run():
-        *state[:], info = compiled(*state, batch)
-        return info
+        *state[:], terms = compiled(*state, batch)
+        return terms
 
     return {"compile": seconds, **timed(run, repeats), "flops": flops(compiled), "temp_mb": temporary(compiled)}
 
 
-def measure_view(config, clip, repeats, rows):
+def measure_view(system, clip, repeats, rows):
     """One view, or its first rows."""
-    params = model.init_params(jax.random.key(2), config)
+    params = system.init(jax.random.key(2))
     camera = Camera(clip.intrinsics, clip.camera_from_world)
     video = Video(clip.images.astype(np.float32) / 255, camera, clip.near, clip.far)
-    prepared = novel_view.prepare(params, video, config=config)
-    inputs, frames = novel_view.target_inputs(
-        video.images, camera, clip.near, clip.far, Camera(*(x[3] for x in camera)), 5, config=config
+    prepared = novel_view.prepare(params, video, system=system)
+    inputs, frames = target_inputs(
+        video.images, camera, clip.near, clip.far, Camera(*(x[3] for x in camera)), 5, system=system
     )
     maps = None if prepared.maps is None else jax.tree.map(lambda x: x[frames], prepared.maps)
     start = time.perf_counter()
-    compiled = novel_view.render_inputs.lower(params, inputs, maps, config=config, rows=rows or None).compile()
+    compiled = novel_view.render_inputs.lower(params, inputs, maps, system=system, rows=rows or None).compile()
     seconds = time.perf_counter() - start
     run = lambda: compiled(params, inputs, maps)
     return {"compile": seconds, **timed(run, repeats), "flops": flops(compiled), "temp_mb": temporary(compiled)}
@@ -118,19 +118,19 @@ def temporary(compiled):
 def main():
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Times a training step and a rendered view.")
-    parser.add_argument("--preset", default="small")
+    parser.add_argument("--preset", default="small", choices=tuple(RECIPES))
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--rows", type=int, default=0)
     options = parser.parse_args()
-    config, peak = preset(options.preset), matmul_peak()
-    clip = noise_clip(config)
+    recipe, peak = RECIPES[options.preset], matmul_peak()
+    clip = noise_clip(recipe)
     stages = {
-        "training step": lambda: measure_step(config, clip, options.repeats),
-        f"view, {options.rows or 'all'} rows": lambda: measure_view(config, clip, options.repeats, options.rows),
+        "training step": lambda: measure_step(recipe, clip, options.repeats),
+        f"view, {options.rows or 'all'} rows": lambda: measure_view(recipe.system, clip, options.repeats, options.rows),
     }
     for name, stage in stages.items():
         reset_peak()
-        row = {"preset": config.name, "what": name, **stage(), "peak_mb": peak_megabytes()}
+        row = {"preset": options.preset, "what": name, **stage(), "peak_mb": peak_megabytes()}
         if row["flops"]:
             row["share_of_matmul_peak"] = row["flops"] / row["best"] / peak
         row |= {"matmul_gflops": peak / 1e9, "load": os.getloadavg()[0], "device": jax.devices()[0].device_kind}

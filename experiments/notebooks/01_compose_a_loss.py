@@ -1,11 +1,11 @@
 # %% [markdown]
 # # Compose a loss and weight it
 #
-# A loss here is a plain function of a prediction and of what is true. `Terms` holds one number for each of the losses
-# that the library knows, and the total is their weighted sum. This notebook writes a loss that the library does not
-# know, checks it before it is trusted, adds it to the others, and shows what it buys and what it costs.
+# A loss here is a plain function of a prediction and of what is true. Losses and weights are dicts of numbers by name,
+# and the total is their weighted sum. This notebook writes a loss that the library does not know, checks it before it
+# is trusted, adds it to the others, and shows what it buys and what it costs.
 #
-# Everything runs on a small simulated clip, whose truth is exact, with the `tiny` preset.
+# Everything runs on a small simulated clip, whose truth is exact, with the `tiny` recipe.
 
 # %%
 import time
@@ -15,44 +15,40 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from zestjax.analysis import frame_maps
-from zestjax.assembly import dequantised
-from zestjax.batches import batch_from_clip, prepare_clip
+from zestjax.base.numerics import safe_norm
+from zestjax.frames.assembly import dequantised
 from zestjax.losses.means import mean_over_valid
-from zestjax.losses.objective import Terms, measured, weighted_sum
-from zestjax.measures import make_measures
 from zestjax.metrics import psnr
-from zestjax.model import encode, init_params
-from zestjax.numerics import safe_norm
-from zestjax.prediction import render_rays
-from zestjax.presets import preset
+from zestjax.model import predict
 from zestjax.simulate.clips import training_clip
 from zestjax.solve import Adam
 from zestjax.testing import assert_finite, assert_grads_match, explain_gradient
+from zestjax.train.batches import batch_from_clip, prepare_clip
+from zestjax.train.learn import training_objective
+from zestjax.train.recipes import TINY
 
-config = preset("tiny")
-clip = training_clip(jax.random.key(3), height=config.height, width=config.width, frames=8, targets=4)
-prepared = prepare_clip(jax.random.key(0), clip, config)
-batches = [batch_from_clip(jax.random.key(i), prepared, config) for i in range(16)]
-params = init_params(jax.random.key(1), config)
-f"{len(clip.images)} frames of {config.height} x {config.width}; a batch is {len(batches[0].truth.pixels)} rays"
+system, height, width = TINY.system, TINY.height, TINY.width
+clip = training_clip(jax.random.key(3), height=height, width=width, frames=8, targets=4)
+prepared = prepare_clip(jax.random.key(0), clip, system)
+batches = [batch_from_clip(jax.random.key(i), prepared, TINY) for i in range(16)]
+params = system.init(jax.random.key(1))
+f"{len(clip.images)} frames of {height} x {width}; a batch is {len(batches[0].truth.pixels)} rays"
 
 # %% [markdown]
 # ## From parameters to a prediction
 #
-# Three steps: what each frame says about itself, the volumes of the target, the rays. All are pure functions of
-# arrays, so the whole is one: `predict` can be compiled, differentiated and mapped.
+# What each frame says about itself, then the volumes of the target and the rays through them. Both are pure functions
+# of arrays, so the whole is one: it can be compiled, differentiated and mapped.
 
 
 # %%
-def predict(params, batch):
-    maps = frame_maps(params.analysis, dequantised(batch.evidence))
-    encoding = encode(params, batch.inputs, maps, config=config)
-    prediction = render_rays(params, encoding, batch.inputs, batch.truth.pixels, config=config)
-    return prediction, make_measures(params, encoding, batch.inputs, config=config)
+@jax.jit
+def predicted(params, batch):
+    maps = system.frames(params.analysis, dequantised(batch.evidence))
+    return predict(params, batch.inputs, maps, batch.truth.pixels, system=system)
 
 
-prediction = jax.jit(lambda p, b: predict(p, b)[0])(params, batches[0])
+prediction = predicted(params, batches[0])
 {name: getattr(prediction, name).shape for name in ("colour", "depth", "dynamicness", "weights")}
 
 # %% [markdown]
@@ -65,7 +61,7 @@ prediction = jax.jit(lambda p, b: predict(p, b)[0])(params, batches[0])
 
 # %%
 def across(colour):
-    rows = colour.reshape(config.crop_rows, config.width, 3)
+    rows = colour.reshape(-1, width, 3)
     return rows[:, 1:] - rows[:, :-1]
 
 
@@ -104,36 +100,27 @@ print("finite where colours are equal, and the gradient matches finite differenc
 # %% [markdown]
 # ## Into the objective
 #
-# The library's losses are measured only if their weight is not absent (`None` or the number 0): what is absent is not
-# in the compiled program. Ours is added with its own weight, in the same way.
+# `training_objective` makes one function of a system and its weights: `objective(params, batch) -> (total, terms)`.
+# Ours joins the library's losses under a name of its own, as a measure of a prediction and the truth. A loss is
+# measured only if its weight is not absent (`None` or the number 0): what is absent is not in the compiled program.
 
 # %%
-WEIGHTS = Terms(rec=20.0, static_rec=8.0, b=1e-3, depth_ce=None, mask=0.05)
+WEIGHTS = dict(rec=20.0, static_rec=8.0, b=1e-3, mask=0.05)
 
 
-def losses(params, batch, edge_weight):
-    prediction, measures = predict(params, batch)
-    terms = measured(measures, prediction, batch.truth, WEIGHTS)
-    ours = edge_loss(prediction.colour, batch.truth.colour) if edge_weight else None
-    return terms, ours
+def objective_with(edge):
+    own = {"edge": lambda prediction, truth: edge_loss(prediction.colour, truth.colour)}
+    return training_objective(system, weights=WEIGHTS | {"edge": edge}, own=own)
 
 
-def total(params, batch, edge_weight=0.0):
-    terms, ours = losses(params, batch, edge_weight)
-    return weighted_sum(terms, WEIGHTS) + (edge_weight * ours if edge_weight else 0.0)
-
-
-def named(params):
-    terms, ours = losses(params, batches[0], 1.0)
-    return {k: v for k, v in terms._asdict().items() if v is not None} | {"edge (ours)": ours}
-
-
-print(explain_gradient(named, params))
+objective = objective_with(1.0)
+print(explain_gradient(lambda p: objective(p, batches[0])[1], params))
 
 # %% [markdown]
 # The table gives the value of each loss and how hard it pulls at each part of the model: a quick way to choose a
 # weight is to let a new loss pull about as hard as the old ones. The rows before weighting say that a weight near 1
-# does that.
+# does that. Weights can also be told at the call, `objective(params, batch, weights)`, as numbers or as arrays: that is
+# what the notebooks on single terms and on sweeps use.
 #
 # ## With and without
 #
@@ -141,27 +128,21 @@ print(explain_gradient(named, params))
 
 
 # %%
-def trained(edge_weight, steps=300):
-    solver = Adam(learning_rate=2e-3, clip_norm=1.0)
-
-    @jax.jit
-    def step(params, state, batch):
-        value, grads = jax.value_and_grad(total)(params, batch, edge_weight)
-        return solver.apply(params, state, grads, value)
-
-    now, state = step(params, solver.init_state(params), batches[0])  # compiles
+def trained(edge, steps=300):
+    solver = Adam(fun=objective_with(edge), has_aux=True, learning_rate=2e-3, clip_norm=1.0)
+    update = jax.jit(solver.update)
+    now, state = update(params, solver.init_state(params, batches[0]), batches[0])  # compiles
     start = time.perf_counter()
     for i in range(1, steps):
-        now, state = step(now, state, batches[i % 12])
+        now, state = update(now, state, batches[i % 12])
     jax.block_until_ready(now)
     return now, (time.perf_counter() - start) / (steps - 1)
 
 
-shown = jax.jit(lambda p, b: predict(p, b)[0].colour)
 rows = []
 for edge_weight in (0.0, 2.0):
     fitted, seconds = trained(edge_weight)
-    colours = [shown(fitted, b) for b in batches[12:]]
+    colours = [predicted(fitted, b).colour for b in batches[12:]]
     truths = [jnp.asarray(b.truth.colour) for b in batches[12:]]
     score = np.mean([psnr(c[None], t[None]) for c, t in zip(colours, truths, strict=True)])
     edges = np.mean([edge_loss(c, t) for c, t in zip(colours, truths, strict=True)])
@@ -169,9 +150,7 @@ for edge_weight in (0.0, 2.0):
     print(f"weight {edge_weight}: PSNR {score:.2f} dB, edge loss {edges:.4f}, {1e3 * seconds:.0f} ms a step")
 
 # %%
-images = [
-    np.asarray(x).reshape(config.crop_rows, config.width, 3).clip(0, 1) for x in (rows[0][4], rows[1][4], truths[0])
-]
+images = [np.asarray(x).reshape(-1, width, 3).clip(0, 1) for x in (rows[0][4], rows[1][4], truths[0])]
 figure, axes = plt.subplots(3, 1, figsize=(6, 3.6), dpi=80)
 for axis, image, title in zip(axes, images, ("weight 0", "weight 2", "truth"), strict=True):
     axis.imshow(image)

@@ -12,84 +12,69 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from zestjax.batches import batch_from_clip, prepare_clip
-from zestjax.learn import step_gradients
-from zestjax.losses.objective import Terms
-from zestjax.model import init_params
-from zestjax.presets import preset
 from zestjax.simulate.clips import training_clip
 from zestjax.solve import Adam
+from zestjax.train.batches import batch_from_clip, prepare_clip
+from zestjax.train.learn import training_objective
+from zestjax.train.recipes import TINY
 
-config = preset("tiny")
-size = dict(height=config.height, width=config.width, frames=8, targets=4)
+system = TINY.system
+size = dict(height=TINY.height, width=TINY.width, frames=8, targets=4)
 clips = [training_clip(jax.random.key(i), **size) for i in (12, 5)]
-prepared = [prepare_clip(jax.random.key(0), clip, config) for clip in clips]
-learned_from = [batch_from_clip(jax.random.key(i), prepared[0], config) for i in range(24)]
-held_back = [batch_from_clip(jax.random.key(i), prepared[1], config) for i in range(8)]
+prepared = [prepare_clip(jax.random.key(0), clip, system) for clip in clips]
+learned_from = [batch_from_clip(jax.random.key(i), prepared[0], TINY) for i in range(24)]
+held_back = [batch_from_clip(jax.random.key(i), prepared[1], TINY) for i in range(8)]
 
 # %% [markdown]
 # ## The step, for one and for many
 #
-# Two weights are swept: that of the motion mask, and that of the entropy of the blend. The others are Python numbers,
-# which stay constants of the program. `vmap` says which arguments differ from run to run (0) and which are shared
-# (None).
+# One weight is swept, that of the motion mask. The others are Python numbers, which stay constants of the program.
+# `vmap` says which arguments differ from run to run (0) and which are shared (None).
 
 # %%
-solver = Adam(learning_rate=2e-3, clip_norm=1.0)
+WEIGHTS = dict(rec=20.0, static_rec=8.0, b=1e-3, depth_ce=0.1, frame_ce=0.1, frame_mask=0.1, mask=0.05)
+objective = training_objective(system, weights=WEIGHTS)
+solver = Adam(fun=lambda p, batch, mask: objective(p, batch, WEIGHTS | {"mask": mask})[0],
+              learning_rate=2e-3, clip_norm=1.0)  # fmt: skip
+many = jax.jit(jax.vmap(solver.update, in_axes=(0, 0, None, 0)))
+one = jax.jit(solver.update)
 
-
-def step(params, state, batch, mask, b):
-    weights = Terms(rec=20.0, static_rec=8.0, depth_ce=0.1, frame_ce=0.1, frame_mask=0.1, mask=mask, b=b)
-    grads, terms, total = step_gradients(config, weights=weights)(params, batch)
-    return *solver.apply(params, state, grads, total), (terms.rec, terms.mask)
-
-
-many = jax.jit(jax.vmap(step, in_axes=(0, 0, None, 0, 0)))
-one = jax.jit(step)
-
-MASK = np.array([0, 0.005, 0.02, 0.05, 0.2, 0.5, 2, 5], np.float32)
-start = init_params(jax.random.key(1), config)
+MASK = jnp.array([0, 0.005, 0.02, 0.05, 0.2, 0.5, 2, 5])
+start = system.init(jax.random.key(1))
 copies = lambda tree: jax.tree.map(lambda x: jnp.broadcast_to(x, (len(MASK), *x.shape)), tree)
-params, state = copies(start), copies(solver.init_state(start))
-entropy = jnp.full(len(MASK), 1e-3)
-params, state, _ = many(params, state, learned_from[0], jnp.asarray(MASK), entropy)
+params, state = many(copies(start), copies(solver.init_state(start)), learned_from[0], MASK)
 began = time.perf_counter()
 for i in range(1, 120):
-    params, state, _ = many(params, state, learned_from[i % len(learned_from)], jnp.asarray(MASK), entropy)
+    params, state = many(params, state, learned_from[i % len(learned_from)], MASK)
 jax.block_until_ready(params)
 together = (time.perf_counter() - began) / 119
 
-middle = jnp.float32(0.05), jnp.float32(1e-3)
-single = one(start, solver.init_state(start), learned_from[0], *middle)[:2]
+single = one(start, solver.init_state(start), learned_from[0], MASK[3])
 began = time.perf_counter()
 for i in range(1, 30):
-    single = one(*single, learned_from[i % len(learned_from)], *middle)[:2]
+    single = one(*single, learned_from[i % len(learned_from)], MASK[3])
 jax.block_until_ready(single)
 alone = (time.perf_counter() - began) / 29
 print(f"eight together: {1e3 * together:.0f} ms a step; one after the other: {8e3 * alone:.0f} ms")
 
 # %% [markdown]
-# On a CPU the eight share the cores, and the gain is small; on an accelerator, which a model of this size leaves
-# idle, they cost little more than one. Either way there is one compile instead of eight, and the runs see the same
-# batches, so that their differences are the weights' alone.
+# On a CPU the eight share the cores, and the gain is small, or none; on an accelerator, which a model of this size
+# leaves idle, they cost little more than one. Either way there is one compile instead of eight, and the runs see the
+# same batches, so that their differences are the weights' alone.
 #
 # ## What the weight does
 #
 # The models are judged on the scene they learned from, and on one that none has seen.
 
-
 # %%
-@jax.jit
-@jax.vmap
-def measures(params, batch):
-    """Squared colour error and motion mask loss of a batch."""
-    terms = step_gradients(config, weights=Terms(rec=1.0, mask=1.0))(params, batch)[1]
-    return terms.rec, terms.mask
+judge = training_objective(system, weights=dict(rec=1.0, mask=1.0))
+terms = jax.jit(jax.vmap(lambda params, batch: judge(params, batch)[1], in_axes=(0, None)))
 
 
 def judged(batches):
-    each = [measures(params, jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(MASK)), b)) for b in batches]
-    return np.asarray(each).mean(0)
+    """Squared colour errors and motion mask losses of all models, means over batches."""
+    each = [terms(params, batch) for batch in batches]
+    return [np.mean([found[name] for found in each], axis=0) for name in ("rec", "mask")]
 
 
 scores = {"the scene learned from": judged(learned_from[:8]), "an unseen scene": judged(held_back)}
@@ -116,15 +101,16 @@ figure.tight_layout()
 # ## Gradients in the weights
 #
 # Weights are arguments like any other, so one can also ask for the slope of a result in a weight: here of the colour
-# error on the unseen scene after one more step, in the weight of the mask. Its sign says which way to turn the knob.
+# error on the unseen scene after one more step, in the weight of the mask: a gradient through a gradient. Its sign says
+# which way to turn the knob.
 
 
 # %%
 def after_a_step(mask, params, state):
-    params, _, _ = step(params, state, learned_from[0], mask, jnp.float32(1e-3))
-    return step_gradients(config, weights=Terms(rec=1.0))(params, held_back[0])[2]
+    params, _ = solver.update(params, state, learned_from[0], mask)
+    return judge(params, held_back[0])[1]["rec"]
 
 
 first = jax.tree.map(lambda x: x[3], (params, state))
-slope = jax.jit(jax.jacfwd(after_a_step))(jnp.float32(MASK[3]), *first)
-print(f"slope of the unseen scene's colour error in the weight of the mask at {MASK[3]}: {float(slope):+.2e}")
+slope = jax.jit(jax.grad(after_a_step))(MASK[3], *first)
+print(f"slope of the unseen scene's colour error in the weight of the mask at {MASK[3]:g}: {float(slope):+.2e}")

@@ -9,6 +9,7 @@ origin   what a clip is a function of, as text; it is stored with the clip and c
 """
 
 import argparse
+import dataclasses
 import functools
 import hashlib
 import io
@@ -50,7 +51,8 @@ def clip_folder(spec, *, root=None):
 
 def evidence_folder(folder, planes):
     """Where the evidence of a folder's clips lies: by planes and by the code that finds it."""
-    parts = ("evidence", "optical_flow", "assembly", "selection", "planesweep", "resample")
+    parts = ("frames/evidence", "frames/cells", "frames/optical_flow", "frames/assembly", "frames/selection",
+             "planesweep", "resample", "cameras")  # fmt: skip
     code = _code(*(f"{name}.py" for name in parts))
     return Path(folder) / f"evidence-{planes}-{code}"
 
@@ -121,12 +123,13 @@ def make_clip(spec, folder, index):
     """Render clip `index` and find its evidence, those that `folder` lacks."""
     path, found = clip_path(folder, index), clip_path(evidence_folder(folder, spec.planes), index)
     if spec.planes and not found.exists():
-        from zestjax.batches import clip_from_arrays, prepare_clip
-        from zestjax.presets import preset
+        from zestjax.frames.analysis import OwnMaps
+        from zestjax.systems.presets import ZEST
+        from zestjax.train.batches import clip_from_arrays, prepare_clip
 
         clip, key = clip_from_arrays(_clip_arrays(spec, path, index)), hole_key(spec.seed, index)
-        prepared = prepare_clip(key, clip, preset("small", evidence_planes=spec.planes))
-        assert prepared.evidence is not None  # of the preset's encoder
+        prepared = prepare_clip(key, clip, dataclasses.replace(ZEST, frames=OwnMaps(spec.planes)))
+        assert prepared.evidence is not None  # of a system with maps of its frames
         evidence = {f"{EVIDENCE}{name}": array for name, array in prepared.evidence._asdict().items()}
         write_clip(found, evidence | {"holes": np.array(prepared.holes, int)}, origin_of(spec, index))
     if not path.exists():

@@ -63,14 +63,16 @@ def _simulate(commands):
 def _train(commands):
     command = _command(commands, "train", "scene-agnostic training", _run_train)
     command.add_argument("--preset", default="small", help="tiny, small or paper (default small)")
-    command.add_argument("--system", default="zest", help="zest, zest-geometry, zest-motion or zest-none")
+    command.add_argument(
+        "--system", default="zest", help="zest, zest-geometry, zest-motion, zest-none, or nsff (default zest)"
+    )
     command.add_argument("--stage", default="all", help="frames (what each says of itself), views (the rest) or all")
     command.add_argument(
         "--scenes", nargs="+", default=(), metavar="PATH", help="learn from these (default: simulated)"
     )
     command.add_argument("--steps", type=_positive, default=20_000, help="in all, and length of the schedule")
     command.add_argument("--precision", default="float32", help="of the networks: float32 or bfloat16")
-    command.add_argument("--peak", type=_positive_float, default=2e-3, help="highest learning rate (default 0.002)")
+    command.add_argument("--peak", type=_positive_float, help="highest learning rate (default: the preset's)")
     command.add_argument("--minutes", type=_positive_float, metavar="M", help="stop after so much stepping in all")
     command.add_argument("--resume", action="store_true", help="go on from the folder's newest checkpoint")
     command.add_argument("--weights", type=Path, metavar="W", help="start from these")

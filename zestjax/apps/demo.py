@@ -57,7 +57,7 @@ def demo(out, *, quiet=False, weights=None):
 
 def _bench(model, options, out, quiet):
     """Scores, pictures and film of the zest-bench scene: (dict for metrics.json, film's path)."""
-    opened = open_scene(options.scene, model.config, targets=options.targets)
+    opened = open_scene(options.scene, model.recipe, targets=options.targets)
     view_of, frames = Renderer(model, opened.scene.video, steady=True), []
     report = score_scene(view_of, opened, options, out)
     shutil.copyfile(out / report["targets"][0]["file"], out / "side_by_side.png")

@@ -116,7 +116,7 @@ def devices() -> list[Finding]:
 
 
 def flags() -> list[Finding]:
-    """`XLA_FLAGS` and what became of it at `import zestjax`, see `zestjax.backend`."""
+    """`XLA_FLAGS` and what became of it at `import zestjax`, see `zestjax.base.backend`."""
     state, found = zestjax.BACKEND
     said = {
         "off": "fused sums are switched off by zestjax",

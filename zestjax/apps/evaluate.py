@@ -13,16 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax import floors, mvsnerf, novel_view
+from zestjax import novel_view
 from zestjax.apps import results
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
 from zestjax.apps.tables import counted, headline, lacking, write_table
-from zestjax.apps.weights import PUBLISHED, arithmetic, at_precision, open_weights, standing_still
+from zestjax.apps.weights import arithmetic, at_precision, open_weights, standing_still
 from zestjax.io.figures import depth_picture, error_picture, share_picture, side_by_side
 from zestjax.io.lpips import load_lpips
 from zestjax.io.pictures import write_image
+from zestjax.judge import floors
 
 LABELS = ("nearest input", "novel view", "truth", "error", "depth", "dynamicness")
 
@@ -83,7 +84,7 @@ def evaluate_scene(model, options, out):
     Returns:
       dict, the content of metrics.json.
     """
-    opened = open_scene(options.scene, model.config, size=options.size, protocol=options.protocol,
+    opened = open_scene(options.scene, model.recipe, size=options.size, protocol=options.protocol,
                         targets=options.targets, layout=options.format)  # fmt: skip
     model = standing_still(model) if options.still else model
     return score_scene(Renderer(model, opened.scene.video, steady=True), opened, options, out)
@@ -104,8 +105,8 @@ def score_scene(view_of, opened, options, out):
         print(f"evaluate: {lacks}", file=sys.stderr)
     height, width = scene.video.images.shape[1:3]
     report = {
-        "scene": scene.name, "system": model.system, "protocol": options.protocol, "height": height, "width": width,
-        "preset": model.config.name, "precision": getattr(model.config, "precision", "float32"),
+        "scene": scene.name, "system": model.name, "protocol": options.protocol, "height": height, "width": width,
+        "preset": model.preset, "precision": model.system.precision,
         "device": device_name(), "weights": str(model.path),
         **summary(rows), "prepare_seconds": number(view_of.prepare_seconds),
         "compile_seconds": number(view_of.compile_seconds), "targets": [row["row"] for row in rows],
@@ -129,17 +130,16 @@ class Renderer:
     """Views of one prepared video, each with its seconds.
 
     model: `weights.Model`. video: `Video`. steady: what compiles first is run twice, so that seconds are those of
-    compiled programs; for those who report them. changes: fields of the configuration replaced when rendering.
+    compiled programs; for those who report them. system: to render with in place of the model's own.
     prepare_seconds, compile_seconds: None where nothing was run twice to tell them apart.
     """
 
-    def __init__(self, model, video, *, steady=False, **changes):
+    def __init__(self, model, video, *, steady=False, system=None):
         self.model = model
         self.prepare_seconds = self.compile_seconds = None
-        self.config = dataclasses.replace(model.config, **changes)
-        self.system = mvsnerf if model.system == PUBLISHED else novel_view
+        self.system = model.system if system is None else system
         self.video = jax.tree.map(jnp.asarray, video)
-        prepare = lambda: jax.block_until_ready(self.system.prepare(model.params, self.video, config=model.config))
+        prepare = lambda: jax.block_until_ready(novel_view.prepare(model.params, self.video, system=model.system))
         self.prepared, self.first_seconds = timed(prepare)
         if steady:
             self.prepared, self.prepare_seconds = timed(prepare)
@@ -148,8 +148,8 @@ class Renderer:
         """(`View`, seconds)."""
         camera = jax.tree.map(jnp.asarray, camera)
         render = lambda: jax.block_until_ready(
-            self.system.render_view(
-                self.model.params, self.prepared, camera, frame_time, config=self.config, exclude=exclude
+            novel_view.render_view(
+                self.model.params, self.prepared, camera, frame_time, system=self.system, exclude=exclude
             )
         )
         view, seconds = timed(render)

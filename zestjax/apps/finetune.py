@@ -15,17 +15,18 @@ import numpy as np
 
 from zestjax import novel_view
 from zestjax.apps.loop import LoopOptions, run_loop
-from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
+from zestjax.apps.own_frames import known_of, own_frame_batches
 from zestjax.apps.scenes import digest, open_scene, place_of
 from zestjax.apps.train import run_name, summarise
 from zestjax.apps.weights import arithmetic, open_weights
-from zestjax.learn import find_fault, make_train_step
-from zestjax.losses.objective import Terms
-from zestjax.measures import measurable
-from zestjax.training import TrainState
+from zestjax.base.parts import to_stored
+from zestjax.frames.known import answers_of
+from zestjax.train.learn import find_fault
+from zestjax.train.recipes import Cosine
+from zestjax.train.training import TrainState
 
-RATE = 1e-3
-STILL_WEIGHTS = Terms(static_rec=20.0)
+RATE = Cosine(1e-3, 1e-3, 5)
+STILL_WEIGHTS = dict(static_rec=20.0)
 MOVING = 0.3  # probability of moving from which a pixel is left out, and its surroundings with it
 FOREVER = 1_000_000
 CHECKPOINT_SECONDS = 60.0  # the default budget: a run that asks for more loses at most this much to a kill
@@ -60,31 +61,35 @@ def finetune(options):
     """
     model = open_weights(options.weights)
     opened = open_scene(
-        options.scene, model.config, size=options.size, protocol=None, layout=options.format, exclude=options.exclude
+        options.scene, model.recipe, size=options.size, protocol=None, layout=options.format, exclude=options.exclude
     )
     video = opened.scene.video
     if len(video.images) - len(set(options.exclude)) < 3:
         raise ValueError(f"finetune: --exclude leaves too few of {len(video.images)} frames; leave at least 3.")
     moving = moving_pixels(model, video, options.exclude)
-    weights = measurable(model.config, FRAMES_WEIGHTS) if moving is None else STILL_WEIGHTS
-    init, step_fn = make_train_step(model.config, steps=FOREVER, weights=weights, peak=RATE, floor=RATE, warmup=5)
-    explain = functools.partial(find_fault, config=model.config, weights=weights)
+    known = known_of(opened.scene)._replace(moving=moving)
+    recipe = dataclasses.replace(model.recipe, rate=RATE)
+    recipe = recipe.of(model.system, known=answers_of(known)) if moving is None else recipe.weighted(STILL_WEIGHTS)
+    (init, step_fn), objective = recipe.trainer(steps=FOREVER), recipe.objective()
+    explain = functools.partial(find_fault, objective)
     params = jax.tree.map(jnp.array, model.params)  # copies: the step donates
     loop = LoopOptions(
         options.out, options.steps, options.budget, options.resume, CHECKPOINT_SECONDS, quiet=options.quiet
     )
     metadata = model.metadata | {
-        "seed": options.seed, "start": run_name(model.path), "scene": place_of(options.scene),
+        "recipe": to_stored(recipe), "seed": options.seed, "start": run_name(model.path),
+        "scene": place_of(options.scene),
         "data": {"frames": digest(video), "exclude": list(options.exclude)},
     }  # fmt: skip
-    batch_at = frame_batches(video, model.config, seed=options.seed, exclude=options.exclude, moving=moving)
+    batch_at = own_frame_batches(known, recipe, seed=options.seed, exclude=options.exclude)
+    step_fn = jax.jit(step_fn, donate_argnums=(0, 1))
     result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "finetune")
 
 
 def moving_pixels(model, video, exclude):
     """(N, H, W) bool of what may move, by the frames' own analysis; None where the model has none."""
-    maps = novel_view.prepare(model.params, video, config=model.config, exclude=exclude).maps
+    maps = novel_view.prepare(model.params, video, system=model.system, exclude=exclude).maps
     if maps is None:
         return None
     size = video.images.shape[2:0:-1]

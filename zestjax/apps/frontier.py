@@ -7,6 +7,7 @@ on the frontier when no other is both faster and better.
 import csv
 import dataclasses
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,15 +23,17 @@ from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.cameras import resized
 from zestjax.io.files import write_bytes
 from zestjax.io.pictures import resize_area
+from zestjax.systems.sampling import Even
+from zestjax.systems.system import System
 
 COLUMNS = ("setting", "psnr_full", "psnr_dynamic", "ssim_full", "seconds_per_frame", "peak_mb", "pareto")
 
 
 class Setting(NamedTuple):
-    """name: str. changes: fields of the `Config` replaced. scale: of the resolution."""
+    """name: str. system: `System` to render with. scale: of the resolution."""
 
     name: str
-    changes: dict
+    system: System
     scale: float = 1.0
 
 
@@ -48,23 +51,24 @@ class FrontierOptions:
     quiet: bool = False
 
 
-def settings_of(config):
-    """The settings tried with weights of a configuration; the first is its own."""
-    views, planes = config.key_frames, config.planes
-    tried = [Setting("as trained", {})]
-    if config.conditioning == "pooled":
-        tried += [Setting(f"{n} views", {"key_frames": n}) for n in (views * 3 // 2, views // 2, views // 4)]
-    tried += [Setting(f"{n} planes", {"planes": n}) for n in (planes * 3 // 2, planes // 2)]
-    if config.sampling == "guided":
-        tried += [
-            Setting(f"{n} regular samples", {"sampling": "regular", "samples": n})
-            for n in (planes // 2, planes, 2 * planes)
-        ]
+def settings_of(system):
+    """The settings tried with weights of a system; the first is its own."""
+    frames, planes, sampler = system.static.frames, system.space.planes, system.sampler
+    swept = lambda n: replace(system, space=replace(system.space, planes=n))
+    looking = lambda n: replace(system, static=replace(system.static, frames=replace(frames, count=n)))
+    evenly = lambda n: replace(system, sampler=Even(n, "plane"))
+    tried = [Setting("as trained", system)]
+    if system.static.head.looks:  # a head that looks at each view takes any number of them
+        views = frames.count
+        tried += [Setting(f"{n} views", looking(n)) for n in (views * 3 // 2, views // 2, views // 4)]
+    tried += [Setting(f"{n} planes", swept(n)) for n in (planes * 3 // 2, planes // 2)]
+    if sampler.guided:
+        tried += [Setting(f"{n} regular samples", evenly(n)) for n in (planes // 2, planes, 2 * planes)]
     else:
-        tried += [Setting(f"{n} samples", {"samples": n}) for n in (config.samples // 2, config.samples // 4)]
-    tried += [Setting(f"{scale} of the size", {}, scale) for scale in (0.75, 0.5)]
-    less = {"planes": planes // 2}
-    return [*tried, Setting(f"{planes // 2} planes, 0.75 of the size", less, 0.75)]
+        fewer = (max(1, sampler.samples // 2), max(1, sampler.samples // 4))
+        tried += [Setting(f"{n} samples", replace(system, sampler=replace(sampler, samples=n))) for n in fewer]
+    tried += [Setting(f"{scale} of the size", system, scale) for scale in (0.75, 0.5)]
+    return [*tried, Setting(f"{planes // 2} planes, 0.75 of the size", swept(planes // 2), 0.75)]
 
 
 @arithmetic()
@@ -78,10 +82,10 @@ def frontier(options):
       ValueError, WeightsError: a scene or weights that cannot be used.
     """
     model, out = open_weights(options.weights), Path(options.out)
-    opened = open_scene(options.scene, model.config, size=options.size, protocol="held-out", layout=options.format,
+    opened = open_scene(options.scene, model.recipe, size=options.size, protocol="held-out", layout=options.format,
                         targets=options.targets or default_times(options))  # fmt: skip
     scene, rows = opened.scene, []
-    for setting in progress(settings_of(model.config), "frontier", quiet=options.quiet):
+    for setting in progress(settings_of(model.system), "frontier", quiet=options.quiet):
         rows.append({"setting": setting.name, **measure(model, scene, setting)})
         write_rows(out, mark_pareto(rows))
     draw(out / "frontier.png", rows, scene.name)
@@ -106,7 +110,7 @@ def measure(model, scene, setting):
     size = scene.video.images.shape[1:3]
     video = scaled_video(scene.video, setting.scale)
     factors = [new / old for new, old in zip(video.images.shape[1:3], size, strict=True)]
-    view_of = Renderer(model, video, steady=True, **setting.changes)
+    view_of = Renderer(model, video, steady=True, system=setting.system)
     scores, seconds = [], []
     for target in scene.targets:
         view, spent = view_of(resized(target.camera, factors[1], factors[0]), target.time, target.exclude)

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from zestjax.apps import run_folder
 from zestjax.apps.log import Recorder, draw_curve, read_log
 from zestjax.io.files import append_bytes
-from zestjax.training import TrainState, training_steps
+from zestjax.train.training import TrainState, training_steps
 
 MOST_FAULTS = 5  # explained in one call: each costs as much as a step
 

@@ -15,7 +15,7 @@ from zestjax.apps.scoring import number
 from zestjax.apps.tables import counted
 from zestjax.apps.weights import arithmetic, at_precision, open_weights, standing_still
 from zestjax.cameras import resized
-from zestjax.inputs import check_target
+from zestjax.frames.inputs import check_target
 from zestjax.io.pictures import resize_area, to_bytes, write_image
 from zestjax.io.video import write_video
 
@@ -59,7 +59,7 @@ def render(options):
 def _render(options):
     model = at_precision(open_weights(options.weights, published=True), options.precision)
     out = Path(options.out)
-    scene = open_scene(options.scene, model.config, size=options.size, protocol=None, layout=options.format).scene
+    scene = open_scene(options.scene, model.recipe, size=options.size, protocol=None, layout=options.format).scene
     model = standing_still(model) if options.still else model
     path = camera_path(options.path, scene.video, count=options.frames)
     size, count = scene.video.images.shape[1:3], len(path.times)
@@ -107,7 +107,7 @@ def render_path(model, scene, path, *, budget=None, quiet=False):
     def timing(seconds):
         each = float(np.median(seconds))  # the first one's compiling is not in it, if there are three
         return {
-            "device": device_name(), "preset": model.config.name, "frames": len(seconds), "scale": number(factors[1]),
+            "device": device_name(), "preset": model.preset, "frames": len(seconds), "scale": number(factors[1]),
             "seconds_per_frame": number(each), "first_frame_seconds": number(seconds[0]),
             "prepare_seconds": number(view_of.first_seconds), "seconds": number(view_of.first_seconds + sum(seconds)),
             "budget_seconds": budget,

@@ -1,6 +1,6 @@
 """The folder of a training run: held by one process at a time, restored and saved as a whole.
 
-recipe   what makes one run's numbers differ from another's: the names in `RECIPE`, of the metadata
+identity  what makes one run's numbers differ from another's: the names in `IDENTITY`, of the metadata
 threads  the cores that XLA shares a sum between: the last bits of a run depend on their number
 
 The newest whole checkpoint is the run's state; log, weights and curve are made to agree with it when a run resumes.
@@ -22,9 +22,9 @@ from zestjax.apps.log import cut_log
 from zestjax.io.checkpoints import latest_checkpoint, save_checkpoint
 from zestjax.io.files import remove_parts
 from zestjax.io.weights import WeightsError, load_weights, save_weights
-from zestjax.training import TrainState
+from zestjax.train.training import TrainState
 
-RECIPE = ("config", "seed", "data", "stage", "peak", "start", "analysis")  # what a run that resumes must share
+IDENTITY = ("recipe", "seed", "data", "start", "analysis")  # what a run that resumes must share
 LOCK = ".lock"
 
 
@@ -162,11 +162,11 @@ def _cut_logs(out, step):
 
 
 def _differing(before, now):
-    """Names of `RECIPE` that two runs do not share; of a dict, also of its entries."""
-    for name in RECIPE:
+    """Names of `IDENTITY` that two runs do not share; of a dict, also of its entries."""
+    for name in IDENTITY:
         old, new = before.get(name), now.get(name)
         if isinstance(old, dict) and isinstance(new, dict):
-            entries = [key for key in old | new if old.get(key) != new.get(key)]
+            entries = sorted(key for key in old | new if old.get(key) != new.get(key))
             yield from [f"{name} ({', '.join(entries)})"] if entries else []
         elif old != new:
             yield name

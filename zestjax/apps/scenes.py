@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax.apps.host import host_camera
+from zestjax.base.checks import check_option
 from zestjax.cameras import project, unproject
-from zestjax.checks import check_option
 from zestjax.io.files import resolved
 from zestjax.io.scenes import PROTOCOLS, Scene, Target, load_scene
 from zestjax.simulate.bench import BENCH
@@ -28,12 +28,12 @@ class Opened(NamedTuple):
     ceiling: Callable | None
 
 
-def open_scene(name, config, *, size=None, protocol: str | None = "held-out", targets=None, layout=None, exclude=()):
+def open_scene(name, recipe, *, size=None, protocol: str | None = "held-out", targets=None, layout=None, exclude=()):
     """Open a scene.
 
     Args:
       name: folder, or `bench:NAME`.
-      config: `Config`, whose height is the default of a folder's pictures; zest-bench is 144 x 256 by default.
+      recipe: `Recipe`, whose height is the default of a folder's pictures; zest-bench is 144 x 256 by default.
       size: (height, width), or None.
       protocol: `held-out`, `strict` or `paper`; None where no target is wanted.
       targets: times to predict, or None for all. Of zest-bench all means every time, by one held-out camera each.
@@ -56,7 +56,7 @@ def open_scene(name, config, *, size=None, protocol: str | None = "held-out", ta
     if not Path(name).exists():
         hint = f"; did you mean bench:{name}?" if name in BENCH else f", one of {', '.join(BENCH)}."
         raise ValueError(f"{name}: is not a folder; give one that holds a scene, or bench:NAME of zest-bench{hint}")
-    height, width = size or (config.height, None)
+    height, width = size or (recipe.height, None)
     scene = load_scene(
         name, height=height, width=width, layout=layout, protocol=protocol or "strict", targets=targets, exclude=exclude
     )

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax import metrics
-from zestjax.lpips import lpips as lpips_distance
+from zestjax.judge.lpips import lpips as lpips_distance
 
 REGIONS = ("full", "dynamic", "static")
 LEAST_PIXELS = 64

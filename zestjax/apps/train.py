@@ -6,6 +6,7 @@ import functools
 import hashlib
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,21 +16,20 @@ import zestjax
 from zestjax.apps.cache import STALE_DAYS, held_clips, remove_stale_clips
 from zestjax.apps.clips import EVIDENCE, ClipSpec, clip_folder, hole_key
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
-from zestjax.apps.own_frames import FRAMES_WEIGHTS, frame_batches
+from zestjax.apps.own_frames import known_of, own_frame_batches
 from zestjax.apps.producer import ClipSource
 from zestjax.apps.scenes import digest, open_scene, place_of
 from zestjax.apps.tables import counted
-from zestjax.apps.weights import SYSTEMS, arithmetic
-from zestjax.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
-from zestjax.checks import check_option
-from zestjax.evidence import Evidence
-from zestjax.io.weights import load_weights
-from zestjax.learn import FRAME_WEIGHTS, STAGES, find_fault, make_train_step, stage_weights
-from zestjax.losses.objective import present
-from zestjax.measures import measurable, unmeasured
-from zestjax.model import init_params
-from zestjax.presets import preset as preset_of
-from zestjax.training import TrainState, batch_key, clip_index, clip_window
+from zestjax.apps.weights import arithmetic, load_params
+from zestjax.base.checks import check_option
+from zestjax.base.parts import to_stored
+from zestjax.frames.evidence import Evidence
+from zestjax.frames.known import answers_of, shared
+from zestjax.train.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
+from zestjax.train.learn import STAGES, find_fault, stage_weights
+from zestjax.train.recipes import RECIPES, SYSTEMS, recipe_of
+from zestjax.train.terms import measurable, unmeasured
+from zestjax.train.training import TrainState, batch_key, clip_index, clip_window
 
 SCENES_PER_STEP = 4  # of the stage `frames`
 AHEAD = 8  # clips that the producer keeps rendered beyond the newest one in use
@@ -46,8 +46,8 @@ class TrainOptions:
     others that ended long ago (`cache.STALE_DAYS`). clip_count: reuse that many
     clips; None: new ones for ever. window: clips alive at a time. steps_per_clip: steps between one new clip and the
     next. scenes: folders (or `bench:NAME`) whose own frames are predicted from one another; no simulated clips.
-    checkpoint_minutes: between two checkpoints. system: one of `weights.SYSTEMS`. stage: one of `learn.STAGES`.
-    peak: highest learning rate.
+    checkpoint_minutes: between two checkpoints. system: one of `recipes.SYSTEMS`. stage: one of `learn.STAGES`.
+    peak: highest learning rate, by default the recipe's.
     """
 
     out: Path
@@ -67,7 +67,7 @@ class TrainOptions:
     quiet: bool = False
     system: str = "zest"
     stage: str = "all"
-    peak: float = 2e-3
+    peak: float | None = None
     precision: str = "float32"
 
 
@@ -89,58 +89,58 @@ def train(options):
     Raises:
       ValueError, WeightsError: bad options; the folder holds another run; a damaged checkpoint.
     """
-    check_option("train", system=(options.system, tuple(SYSTEMS)), stage=(options.stage, STAGES))
+    check_option("train", system=(options.system, SYSTEMS), stage=(options.stage, STAGES))
     check_option("train", precision=(options.precision, ("float32", "bfloat16")))
-    config = preset_of(options.preset, precision=options.precision, **SYSTEMS[options.system])
     if options.scenes and options.stage == "frames":
         raise ValueError("train: --stage frames learns from exact answers, which --scenes lack; drop one of them.")
-    if options.stage != "all" and config.encoder != "frames":
-        raise ValueError(f"train: --stage {options.stage} needs a preset whose frames are analysed; drop --stage.")
-    videos = [open_scene(name, config, protocol=None).scene.video for name in options.scenes]
-    metadata = run_metadata(config, options, videos)
-    state, step_fn = fresh(config, options)
+    check_option("train", preset=(options.preset, tuple(RECIPES)))
+    whole = recipe_of(options.preset, system=options.system, precision=options.precision)
+    scenes = [open_scene(name, whole, protocol=None).scene for name in options.scenes]
+    frames = shared([known_of(scene) for scene in scenes])
+    recipe = run_recipe(whole, options, known=answers_of(frames[0]) if frames else None)
+    metadata = run_metadata(recipe, options, frames)
+    state, step_fn = fresh(recipe, options)
     limit = None if options.minutes is None else 60 * options.minutes
     loop = LoopOptions(
         options.out, options.steps, limit, options.resume, 60 * options.checkpoint_minutes, quiet=options.quiet
     )
-    explain = functools.partial(find_fault, config=config, weights=run_weights(config, options))
-    say_left_out(config, options)
-    with batches(config, options, videos) as batch_at:
+    explain = functools.partial(find_fault, recipe.objective())
+    with batches(recipe, options, frames) as batch_at:
         result = run_loop(step_fn, state, batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "train")
 
 
-def fresh(config, options):
+def run_recipe(recipe, options, *, known=None):
+    """The `Recipe` of a run: with its stage and its peak, on scenes of which `known` is known (None: on simulated
+    clips). It says on standard error which of the usual terms are left out, and why.
+
+    Raises:
+      ValueError: a system without maps of its frames has no stages; or no term is left.
+    """
+    if options.stage != "all" and recipe.system.frames is None:
+        raise ValueError(f"train: --stage {options.stage} needs a system whose frames are analysed; drop --stage.")
+    wanted = stage_weights(options.stage, weights=dict(recipe.weights.terms))
+    if (lost := unmeasured(recipe.system, wanted, known=known)) and not options.quiet:
+        listed = "; ".join(f"{name} (needs {need})" for name, need in lost.items())
+        print(f"train: this run learns without {listed}", file=sys.stderr)
+    recipe = recipe.weighted(measurable(recipe.system, wanted, known=known))
+    if options.peak is None:
+        return recipe
+    rate = recipe.rate
+    return replace(recipe, rate=replace(rate, peak=options.peak, floor=options.peak * rate.floor / rate.peak))
+
+
+def fresh(recipe, options):
     """A run's first `TrainState`, from the seed or from given weights, and its compiled step."""
     with jax.threefry_partitionable(False):  # the other form of the same generator compiles ten times longer here
-        params: Any = init_params(jax.random.key(options.seed), config)
+        params: Any = recipe.system.init(jax.random.key(options.seed))
     if options.weights is not None:
-        params, _ = load_weights(options.weights, like=params)
+        params = load_params(options.weights, like=params)
     if options.analysis is not None:
-        other: Any = load_weights(options.analysis, like=params)[0]
+        other: Any = load_params(options.analysis, like=params)
         params = params._replace(analysis=other.analysis)
-    init, step_fn = make_train_step(
-        config, steps=options.steps, weights=run_weights(config, options), peak=options.peak, floor=options.peak / 100
-    )
-    return TrainState(params, init(params), 0), step_fn
-
-
-def run_weights(config, options):
-    """`Terms` that a run learns from: those of its stage and of its scenes that its system can measure."""
-    return measurable(config, _wanted(options))
-
-
-def _wanted(options):
-    return stage_weights(options.stage, weights=FRAMES_WEIGHTS if options.scenes else FRAME_WEIGHTS)
-
-
-def say_left_out(config, options):
-    """Name on standard error the usual terms that this system cannot measure, and why."""
-    needs, wanted = unmeasured(config), present(_wanted(options))
-    lost = {name: needs[name] for name, weight in wanted._asdict().items() if weight is not None and name in needs}
-    if lost and not options.quiet:
-        listed = "; ".join(f"{name} (needs {need})" for name, need in lost.items())
-        print(f"train: this system learns without {listed}", file=sys.stderr)
+    init, step_fn = recipe.trainer(steps=options.steps)
+    return TrainState(params, init(params), 0), jax.jit(step_fn, donate_argnums=(0, 1))
 
 
 def say_removed(folders, options):
@@ -150,15 +150,14 @@ def say_removed(folders, options):
         print(f"train: removed clips that no run has used for {STALE_DAYS} days: {listed}", file=sys.stderr)
 
 
-def run_metadata(config, options, videos=()):
-    """Everything that makes one run's numbers differ from another's, as JSON can hold it; `videos`: of its scenes."""
-    data: dict = {"scenes": [digest(video) for video in videos] or "simulated", "clip_count": options.clip_count}
+def run_metadata(recipe, options, frames=()):
+    """Everything that makes one run's numbers differ from another's, as JSON can hold it; `frames`: of its scenes."""
+    data: dict = {"scenes": [digest(known) for known in frames] or "simulated", "clip_count": options.clip_count}
     data |= {"window": options.window, "steps_per_clip": options.steps_per_clip}
-    config = {name: list(v) if isinstance(v, tuple) else v for name, v in dataclasses.asdict(config).items()}
     return {
-        "preset": options.preset, "system": options.system, "config": config, "seed": options.seed,
+        "preset": options.preset, "system": options.system, "recipe": to_stored(recipe), "seed": options.seed,
         "scenes": [place_of(name) for name in options.scenes], "steps": options.steps,
-        "stage": options.stage, "peak": options.peak, "data": data,
+        "stage": options.stage, "data": data,
         "start": run_name(options.weights),
         "analysis": run_name(options.analysis), "zestjax": zestjax.__version__,
         "jax": jax.__version__, "written": time.strftime("%Y-%m-%dT%H:%M:%S"),
@@ -189,27 +188,27 @@ def summarise(result, out, verb):
     )
 
 
-def batches(config, options, videos=()):
-    """Context: step -> batch, from the videos of the scenes named, or from simulated clips."""
-    if videos:
-        return contextlib.nullcontext(_scene_batches(config, options, videos))
-    return _SimulatedBatches(config, options)
+def batches(recipe, options, frames=()):
+    """Context: step -> batch, from the `KnownFrames` of the scenes named, or from simulated clips."""
+    if frames:
+        return contextlib.nullcontext(_scene_batches(recipe, options, frames))
+    return _SimulatedBatches(recipe, options)
 
 
-def _scene_batches(config, options, videos):
+def _scene_batches(recipe, options, frames):
     """step -> batch of one of the scenes in turn."""
-    each = [frame_batches(video, config, seed=options.seed) for video in videos]
+    each = [own_frame_batches(known, recipe, seed=options.seed) for known in frames]
     return lambda step: each[step % len(each)](step // len(each))
 
 
 class _SimulatedBatches:
     """Batches of the sliding window of simulated clips; a context that ends their producer."""
 
-    def __init__(self, config, options):
-        planes = config.evidence_planes if config.encoder == "frames" else 0
-        spec = ClipSpec(options.seed, config.height, config.width, planes=planes)
+    def __init__(self, recipe, options):
+        planes = 0 if recipe.system.frames is None else recipe.system.frames.planes
+        spec = ClipSpec(options.seed, recipe.height, recipe.width, planes=planes)
         folder = clip_folder(spec, root=options.clips)
-        self.config, self.seed, self.count = config, options.seed, options.clip_count
+        self.recipe, self.seed, self.count = recipe, options.seed, options.clip_count
         self.stage = options.stage
         self.window = {"window": options.window, "steps_per_clip": options.steps_per_clip, "count": self.count}
         self.ahead = AHEAD * options.steps_per_clip
@@ -231,8 +230,8 @@ class _SimulatedBatches:
     def batch(self, step):
         key = batch_key(step, seed=self.seed)
         if self.stage == "frames":
-            return frame_batch(key, [self.prepared(step, draw) for draw in range(SCENES_PER_STEP)], self.config)
-        return batch_from_clip(key, self.prepared(step, 0), self.config)
+            return frame_batch(key, [self.prepared(step, draw) for draw in range(SCENES_PER_STEP)], self.recipe.system)
+        return batch_from_clip(key, self.prepared(step, 0), self.recipe, step=step)
 
     def prepared(self, step, draw):
         """`PreparedClip` of one of the clips that a step sees."""
@@ -240,13 +239,13 @@ class _SimulatedBatches:
         wanted = range(live.start, soon.stop)
         wrapped = [index if self.count is None else index % self.count for index in wanted]
         index = clip_index(step, seed=self.seed, draw=draw, **self.window)
-        return prepared_from_arrays(hole_key(self.seed, index), self.source.clip(index, wrapped), self.config)
+        return prepared_from_arrays(hole_key(self.seed, index), self.source.clip(index, wrapped), self.recipe.system)
 
 
-def prepared_from_arrays(key, arrays, config):
+def prepared_from_arrays(key, arrays, system):
     """`PreparedClip` of a stored clip, with its evidence if that was stored too; `key` draws the holes if not."""
     clip = clip_from_arrays(arrays)
     if "holes" not in arrays:
-        return prepare_clip(key, clip, config)
+        return prepare_clip(key, clip, system)
     evidence = Evidence(**{name: arrays[EVIDENCE + name] for name in Evidence._fields})
     return PreparedClip(clip, evidence, tuple(int(i) for i in arrays["holes"]))

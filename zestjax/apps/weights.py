@@ -1,4 +1,4 @@
-"""Weights together with the configuration they belong to: the file carries both."""
+"""Weights together with the recipe they belong to: the file carries both."""
 
 import contextlib
 import dataclasses
@@ -8,37 +8,44 @@ from typing import Any, NamedTuple
 
 import jax
 
-from zestjax.checks import check_option
-from zestjax.io.mvsnerf import STATISTICS, mvsnerf_like, read_mvsnerf
+from zestjax.apps.earlier import recipe_from_config, renamed
+from zestjax.base.checks import check_option
+from zestjax.base.parts import from_stored, to_stored
+from zestjax.io.mvsnerf import read_mvsnerf
 from zestjax.io.weights import WeightsError, load_weights, read_metadata, save_weights
-from zestjax.model import init_params
-from zestjax.mvsnerf import MvsNerfConfig
-from zestjax.presets import Config
-
-SYSTEMS = {
-    "zest": {},
-    "zest-geometry": {"motion": False},
-    "zest-motion": {"geometry": False},
-    "zest-none": {"geometry": False, "motion": False},
-}
-"""What each system changes in a preset."""
-
+from zestjax.systems import presets
+from zestjax.systems.mvsnerf import MVSNERF, STATISTICS, Ends, MvsNerf
+from zestjax.systems.system import Params, System
+from zestjax.train.recipes import PARTS, Fixed, Recipe, pairs
 
 PUBLISHED = "mvsnerf"
-MOST_SIZE = 2**16  # of a number in a configuration: planes, channels or pixels; a larger one is damage
-MOST_LAYERS = 64  # and of what is a layer or a level each: a file may not keep us busy for hours
-COUNTED = ("field_depth", "point_levels", "view_levels", "key_frames")
+KNOWN = (*PARTS, MvsNerf, Ends)  # the parts that a file of weights may name
 
 
 class Model(NamedTuple):
-    """params: learned arrays. config: `presets.Config` or `mvsnerf.MvsNerfConfig`. system: str. path: the file.
-    metadata: dict of the run."""
+    """params: learned arrays. recipe: `Recipe` of the run; of it, system: what `params` belong to. name: the system's,
+    for people. path: the file. metadata: dict of the run."""
 
-    params: Any
-    config: Any
-    system: str
+    params: Params
+    recipe: Recipe
+    name: str
     path: Path
     metadata: dict
+
+    @property
+    def system(self) -> System:
+        """What the parameters belong to."""
+        return self.recipe.system
+
+    @property
+    def preset(self) -> str:
+        """Name of the preset that the run started from."""
+        return str(self.metadata.get("preset", self.name))
+
+    def running(self, system: System, params: Params | None = None) -> "Model":
+        """The same weights, or some of them, run as another system."""
+        recipe = dataclasses.replace(self.recipe, system=system)
+        return self._replace(recipe=recipe, params=self.params if params is None else params)
 
 
 def shipped_weights():
@@ -46,43 +53,34 @@ def shipped_weights():
     return Path(str(resources.files("zestjax") / "weights" / "small.safetensors"))
 
 
-def config_from_json(fields):
-    """A `Config` from its dict in a file.
+def recipe_from_metadata(metadata, known=KNOWN):
+    """The `Recipe` of a file's metadata, of this version or of 0.1.
+
+    Args:
+      metadata: dict of JSON; it may come from anybody.
+      known: the parts that it may name.
 
     Raises:
-      WeightsError: no dict, fields that this version does not know or that are missing, other types, or sizes that no
-        model has.
+      WeightsError: there is none that this version can use.
     """
-    if not isinstance(fields, dict):
-        raise WeightsError(f"the configuration is a {type(fields).__name__}, expected an object")
-    known = {field.name: field.type for field in dataclasses.fields(Config)}
-    if unknown := sorted(fields.keys() - known.keys()):
-        raise WeightsError(f"the configuration has fields that this version does not know: {', '.join(unknown)[:200]}")
-    values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
-    if wrong := [name for name, value in values.items() if not _of_type(value, known[name])]:
-        raise WeightsError(f"the configuration has `{wrong[0]}` {str(values[wrong[0]])[:80]}, which cannot be")
-    if too_many := [name for name in COUNTED if values.get(name, 0) > MOST_LAYERS]:
-        raise WeightsError(f"the configuration has `{too_many[0]}` {values[too_many[0]]}, more than {MOST_LAYERS}")
     try:
-        return Config(**values)
-    except (TypeError, ValueError) as error:
-        raise WeightsError(f"the configuration cannot be: {error}") from error
+        if "recipe" in metadata:
+            found = from_stored(metadata["recipe"], known)
+        elif metadata.get("system") == PUBLISHED:
+            found = published_recipe(metadata["statistics"])
+        else:
+            found = recipe_from_config(metadata["config"])
+        if not isinstance(found, Recipe):
+            raise ValueError(f"it is a {type(found).__name__}, expected a Recipe")
+        return found
+    except (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+        raise WeightsError(f"has no recipe this version can use ({error})") from error
 
 
-def _of_type(value, kind):
-    """Whether a value of JSON is of a field's type, and its numbers of a size that a model can have."""
-    if kind is int:
-        return type(value) is int and 0 <= value <= MOST_SIZE
-    if kind is tuple:
-        sizes = isinstance(value, tuple) and 0 < len(value) <= MOST_LAYERS
-        return sizes and all(type(size) is int and abs(size) <= MOST_SIZE for size in value)
-    return type(value) is kind
-
-
-def system_of(config):
-    """The name of the system that a configuration is."""
-    volumes = (config.geometry, config.motion)
-    return next(name for name, c in SYSTEMS.items() if (c.get("geometry", True), c.get("motion", True)) == volumes)
+def published_recipe(statistics):
+    """The `Recipe` of MVSNeRF's published weights."""
+    system = dataclasses.replace(MVSNERF, static=MvsNerf(statistics=statistics))
+    return Recipe(system, Fixed(pairs(dict(rec=1.0))), height=256, width=320)
 
 
 @contextlib.contextmanager
@@ -96,13 +94,14 @@ def arithmetic(precision=None):
 
 
 @arithmetic()
-def open_weights(path=None, *, system=None, published=False):
-    """Load weights and their configuration.
+def open_weights(path=None, *, system=None, published=False, parts=()):
+    """Load weights and their recipe.
 
     Args:
       path: file; None: the shipped ones.
       system: refuse weights of another system.
       published: MVSNeRF's weights, as `import-mvsnerf` writes them, will do as well.
+      parts: classes of your own that its system is made of.
 
     Returns:
       `Model`.
@@ -112,33 +111,56 @@ def open_weights(path=None, *, system=None, published=False):
     """
     path = Path(path) if path is not None else shipped_weights()
     metadata = read_metadata(path)
-    if metadata.get("system") == PUBLISHED:
-        if not published or system not in (None, PUBLISHED):
-            raise WeightsError(f"{path}: holds MVSNeRF's weights, which only `render` and `evaluate` can use.")
-        if metadata.get("statistics") not in STATISTICS:
-            raise WeightsError(
-                f"{path}: does not say whose statistics its norms have; import the published file again."
-            )
-        params, _ = load_weights(path, like=mvsnerf_like(statistics=metadata["statistics"]))
-        return Model(params, MvsNerfConfig(), PUBLISHED, path, metadata)
+    name = metadata.get("system")
+    if name == PUBLISHED and not (published and system in (None, PUBLISHED)):
+        raise WeightsError(f"{path}: holds MVSNeRF's weights, which only `render` and `evaluate` can use.")
+    if name == PUBLISHED and metadata.get("statistics") not in STATISTICS:
+        raise WeightsError(f"{path}: does not say whose statistics its norms have; import the published file again.")
     try:
-        config = config_from_json(metadata["config"])
-        like = jax.eval_shape(lambda: init_params(jax.random.key(0), config))
-    except (KeyError, TypeError, ValueError, IndexError, ArithmeticError) as error:
-        raise WeightsError(f"{path}: has no configuration this version can use ({error}); use its version.") from error
-    found = system_of(config)
-    if system is not None and system != found:
-        raise WeightsError(f"{path}: holds weights of `{found}`, not `{system}`; train them with --system {system}.")
-    params, _ = load_weights(path, like=like)
-    return Model(params, config, found, path, metadata)
+        recipe = recipe_from_metadata(metadata, (*KNOWN, *parts))
+        name = name if isinstance(name, str) else ablated_name(recipe.system)
+        like = jax.eval_shape(recipe.system.init, jax.random.key(0))
+    except (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+        raise WeightsError(f"{path}: {error}; use its version.") from error
+    if system is not None and system != name:
+        raise WeightsError(f"{path}: holds weights of `{name}`, not `{system}`; train them with --system {system}.")
+    params: Any = load_weights(path, like=like, renamed=None if "recipe" in metadata else names_of(name))[0]
+    return Model(params, recipe, name, path, metadata)
+
+
+def ablated_name(system):
+    """Which of `presets.ABLATED` a system is, by the volumes that it has."""
+    fields = (system.static, system.dynamic)
+    volumes = tuple(getattr(field, "volume", None) is not None for field in fields)
+    names: dict[tuple, str] = {
+        (True, False): "zest-geometry",
+        (False, True): "zest-motion",
+        (False, False): "zest-none",
+    }
+    return "zest" if system.dynamic is None else names.get(volumes, "zest")
+
+
+def load_params(path, *, like):
+    """Parameters of a file, like those given; of this version or of 0.1.
+
+    Raises:
+      WeightsError: see `io.weights.load_weights`.
+    """
+    earlier = "recipe" not in (metadata := read_metadata(path))
+    return load_weights(path, like=like, renamed=names_of(metadata.get("system")) if earlier else None)[0]
+
+
+def names_of(system):
+    """Function from the name of an array of 0.1 to today's."""
+    return (lambda name: f".static{name}") if system == PUBLISHED else renamed
 
 
 def standing_still(model):
     """The `Model` for a scene in which nothing moves: neither the motion volume nor the dynamic field is compiled."""
-    if model.system == PUBLISHED:
+    if model.system.dynamic is None:
         return model
-    params = model.params._replace(motion=None, dynamic=None)
-    return model._replace(params=params, config=dataclasses.replace(model.config, dynamic=False, motion=False))
+    system, params = presets.still(model.system), model.params._replace(dynamic=None)
+    return model.running(system, params if system.frames is not None else params._replace(analysis=None))
 
 
 def at_precision(model, precision):
@@ -151,10 +173,9 @@ def at_precision(model, precision):
     """
     if precision is None:
         return model
-    if model.system == PUBLISHED:
+    if model.name == PUBLISHED:
         check_option("--precision, of MVSNeRF's weights,", precision=(precision, ("float32",)))
-        return model
-    return model._replace(config=dataclasses.replace(model.config, precision=precision))
+    return model.running(dataclasses.replace(model.system, precision=precision))
 
 
 def import_mvsnerf(path, out, *, statistics="batch"):
@@ -166,7 +187,9 @@ def import_mvsnerf(path, out, *, statistics="batch"):
     Raises:
       WeightsError: see `io.mvsnerf.read_mvsnerf`; or the file could not be written.
     """
-    params = read_mvsnerf(path, statistics=statistics)
-    save_weights(out, params, metadata={"system": PUBLISHED, "statistics": statistics, "start": Path(path).name})
+    params = Params(None, read_mvsnerf(path, statistics=statistics), None)
+    recipe = published_recipe(statistics)
+    metadata = {"system": PUBLISHED, "statistics": statistics, "start": Path(path).name, "recipe": to_stored(recipe)}
+    save_weights(out, params, metadata=metadata)
     count = sum(leaf.size for leaf in jax.tree.leaves(params))
     return f"import-mvsnerf: {count:,} values, statistics of the {statistics}: {out}"

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.checks import check_shapes
+from zestjax.base.numerics import safe_divide
 from zestjax.cameras import Camera, project
-from zestjax.checks import check_shapes
-from zestjax.numerics import safe_divide
 from zestjax.resample import bilinear_cells, corner_offsets, gather_corners, interpolate
 
 GAP_LIMIT = 3.0

@@ -11,40 +11,28 @@ import jax.numpy as jnp
 
 from zestjax.fields.conditioning import hidden as hidden_behind
 from zestjax.fields.conditioning import on_surface, over_views
-from zestjax.fields.static import concatenated
-from zestjax.fields.trunk import (
-    ColourHead,
-    Trunk,
-    ViewHead,
-    blend_of_views,
-    direct_colour,
-    init_colour_head,
-    init_trunk,
-    init_view_head,
-    lifted,
-    pooled_views,
-    trunk,
-    view_scores,
-)
+from zestjax.fields.heads import HeadParams, Reading, ViewFeatures
+from zestjax.fields.trunk import Trunk, init_trunk, trunk
 from zestjax.nets.layers import Dense, dense, init_dense, raised
 
 VIEW_FEATURES = 14
-POOLED = 16
-SUMMARIES = 4
-RESIDUAL = 0.1
+SUMMARIES = 4  # and two more of every slot
+HEARSAY = 0.02  # weight of a slot that sees a point but not as what moves: a last resort where no slot does
+EARLY_WIDTH = 24  # of the net that finds the early flow
+CORRECTION = 0.2  # share of the reach by which the trunk corrects the early flow: it was looked up with that one
 
 
 class DynamicParams(NamedTuple):
-    """The time-dependent field. `motion` (early flow from the volume alone) and `views` are None for a direct head."""
+    """The time-dependent field. early: the flow from the volume alone; with `blend` it is None where the head does not
+    look at each view. head: of the field's `heads.Head`."""
 
     trunk: Trunk
     density: Dense
     blend: Dense | None
     flow: Dense
     confidence: Dense
-    colour: ColourHead
-    motion: tuple[Dense, Dense] | None
-    views: ViewHead | None
+    early: tuple[Dense, Dense] | None
+    head: HeadParams
 
 
 class DynamicSample(NamedTuple):
@@ -60,18 +48,16 @@ class DynamicSample(NamedTuple):
     confidence_backward: jax.Array
 
 
-def init_dynamic(key, *, n_point, n_direction, n_volume, n_views, slots, width, depth, head):
-    """Parameters. n_views: values per point that concatenated views add; None where views are pooled."""
-    keys = jax.random.split(key, 9)
-    pooled = POOLED + SUMMARIES + 2 * slots if n_views is None else n_views
-    base = init_trunk(keys[0], n_point, max(n_volume + pooled, 1), width=width, depth=depth)
+def init_dynamic(key, *, n_point, n_condition, n_volume, width, depth, head, looks):
+    """Parameters, as `static.init_static`. n_volume: channels of the volume. looks: the head looks at each view: an
+    early flow says where, and the field has a say in the blend."""
+    keys = jax.random.split(key, 8)
     small = lambda k, n: init_dense(k, width, n, scale=0.1)
-    blending = head == "blend"
-    motion = (init_dense(keys[6], n_volume + n_point, 24), init_dense(keys[7], 24, 6, scale=0.1)) if blending else None
+    first = lambda: init_dense(keys[5], n_volume + n_point, EARLY_WIDTH)
     return DynamicParams(
-        base, small(keys[1], 1), small(keys[2], 1) if blending else None, small(keys[3], 6), small(keys[4], 2),
-        init_colour_head(keys[5], width, n_direction), motion,
-        init_view_head(keys[8], VIEW_FEATURES, width, width=POOLED) if blending else None,
+        init_trunk(keys[0], n_point, n_condition, width=width, depth=depth),
+        small(keys[1], 1), small(keys[2], 1) if looks else None, small(keys[3], 6), small(keys[4], 2),
+        (first(), init_dense(keys[6], EARLY_WIDTH, 6, scale=0.1)) if looks else None, head(keys[7]),
     )  # fmt: skip
 
 
@@ -80,24 +66,16 @@ def early_flow(params, point, volume, *, reach):
 
     It says where to look in the neighbours before their colours are read (flow-compensated aggregation).
     """
-    first, second = params.motion
+    first, second = params.early
     state = jax.nn.relu(dense(first, jnp.concatenate([volume, point], axis=-1)))
     return reach * jnp.tanh(raised(dense(second, state)))
 
 
-class DynamicViews(NamedTuple):
-    """Slots at points. features: (V, U, P). weights: (V, P) trust. summary: (P, SUMMARIES + 2 V)."""
-
-    features: jax.Array
-    weights: jax.Array
-    summary: jax.Array
-
-
 def dynamic_views(samples, times):
-    """Per-view features of `sample_views` for what moves: seen moving, at its own depth, in its slot."""
+    """`ViewFeatures` of `sample_views` for what moves: seen moving, at its own depth, in its slot."""
     agree, behind = on_surface(samples.gap), hidden_behind(samples.gap)
     support = samples.visible * samples.moving * agree
-    weights = support + 0.02 * samples.visible * (1 - behind)
+    weights = support + HEARSAY * samples.visible * (1 - behind)
     deviation = samples.colour - over_views(weights, samples.colour)[None]
     size = jnp.sum(jnp.abs(deviation), axis=1)
     through = samples.visible * jnp.square(jnp.minimum(samples.gap, 0) / 3)
@@ -108,22 +86,22 @@ def dynamic_views(samples, times):
     ]  # fmt: skip
     features = jnp.concatenate([4 * deviation, jnp.stack(scalars, 1)], 1)
     spread = over_views(weights, jnp.stack([size, agree, through, samples.moving], 1))
-    return DynamicViews(features, weights, jnp.concatenate([spread, support, through], 0).T)
+    return ViewFeatures(features, weights, jnp.concatenate([spread, support, through], 0).T)
 
 
-def dynamic_field(params, point, direction, volume, samples, views, *, reach=1.0, early=None, conditioning="multiply"):
+def dynamic_field(
+    params: DynamicParams, point, direction, reading: Reading, *, reach=1.0, early=None, modulation="multiply"
+) -> DynamicSample:
     """Density, colour, flow and confidence of P points at one time.
 
     Args:
       params: `DynamicParams`.
       point: (P, n) encoded position and time.
       direction: (P, Q) encoded.
-      volume: (P, C) looked up in the motion volume; C may be 0.
-      samples: `ViewSamples` of the slots, or None without them.
-      views: `DynamicViews` for a blend head, or None: colours and visibility are then concatenated.
+      reading: what the field's head reads of the points, see `heads`.
       reach: bound of the flow, frustum units; the paper's tanh reaches the whole frustum, 1.
       early: (P, 6) flow that the last layer corrects, or None.
-      conditioning: see `trunk`.
+      modulation: see `trunk`.
 
     Returns:
       `DynamicSample`.
@@ -131,23 +109,12 @@ def dynamic_field(params, point, direction, volume, samples, views, *, reach=1.0
     Source: ZeST-NeRF eq. 5.
     Differs from the reference: with a blend head colours come from the neighbours at the point's displaced position.
     """
-    lift = None if views is None else lifted(params.views, views.features)
-    if views is None:
-        condition = concatenated(volume, samples)
-    else:
-        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
-    state = trunk(params.trunk, point, condition, conditioning=conditioning)
-    if views is not None:
-        scores = view_scores(params.views, lift, state)
-        colour = blend_of_views(scores, views.weights, samples.visible, samples.colour)
-        residual = direct_colour(params.colour, state, direction) - 0.5
-        colour = jnp.clip(colour + RESIDUAL * residual, 0, 1)
-    else:
-        colour = direct_colour(params.colour, state, direction)
+    state = trunk(params.trunk, point, reading.condition, modulation=modulation)
+    colour = reading.colour(state, direction)
     head = lambda part: raised(dense(part, state))
     raw_flow = head(params.flow)
-    flow = reach * jnp.tanh(raw_flow) if early is None else early + 0.2 * reach * jnp.tanh(raw_flow)
-    confidence = jax.nn.sigmoid(head(params.confidence) + 2.0)
+    flow = reach * jnp.tanh(raw_flow) if early is None else early + CORRECTION * reach * jnp.tanh(raw_flow)
+    confidence = jax.nn.sigmoid(head(params.confidence) + 2.0)  # certain until taught otherwise
     logit = jnp.zeros_like(raw_flow[:, 0]) if params.blend is None else head(params.blend)[:, 0]
     return DynamicSample(
         4 * jax.nn.softplus(head(params.density)[:, 0]), colour, logit,

@@ -10,36 +10,21 @@ import jax.numpy as jnp
 
 from zestjax.fields.conditioning import added, on_surface, over_views
 from zestjax.fields.conditioning import hidden as hidden_behind
-from zestjax.fields.trunk import (
-    ColourHead,
-    Trunk,
-    ViewHead,
-    blend_of_views,
-    direct_colour,
-    init_colour_head,
-    init_trunk,
-    init_view_head,
-    lifted,
-    pooled_views,
-    trunk,
-    view_scores,
-)
+from zestjax.fields.heads import HeadParams, Reading, ViewFeatures
+from zestjax.fields.trunk import Trunk, init_trunk, trunk
 from zestjax.nets.layers import Dense, dense, init_dense, raised
 
 VIEW_FEATURES = 13
-POOLED = 16
 SUMMARIES = 5
-RESIDUAL = 0.1
 
 
 class StaticParams(NamedTuple):
-    """The time-independent field. Depth, width and skip are in the shapes; `views` is None for a direct head."""
+    """The time-independent field. Depth, width and skip are in the shapes. head: of the field's `heads.Head`."""
 
     trunk: Trunk
     density: Dense
     blend: Dense
-    colour: ColourHead
-    views: ViewHead | None
+    head: HeadParams
 
 
 class StaticSample(NamedTuple):
@@ -51,28 +36,16 @@ class StaticSample(NamedTuple):
     blend_logit: jax.Array
 
 
-def init_static(key, *, n_point, n_direction, n_volume, n_views, width, depth, head):
-    """Parameters. n_views: values per point that concatenated views add; None where views are pooled."""
-    keys = jax.random.split(key, 5)
-    pooled = POOLED + SUMMARIES if n_views is None else n_views
-    base = init_trunk(keys[0], n_point, max(n_volume + pooled, 1), width=width, depth=depth)
-    views = init_view_head(keys[4], VIEW_FEATURES, width, width=POOLED) if head == "blend" else None
+def init_static(key, *, n_point, n_condition, width, depth, head):
+    """Parameters. n_condition: what the head reads of a point. head: key -> its parameters."""
+    keys = jax.random.split(key, 4)
     blend = init_dense(keys[2], width, 1, scale=0.1)
     return StaticParams(
-        base,
+        init_trunk(keys[0], n_point, n_condition, width=width, depth=depth),
         init_dense(keys[1], width, 1, scale=0.1),
         blend._replace(bias=blend.bias - 2.0),  # static until the motion volume speaks
-        init_colour_head(keys[3], width, n_direction),
-        views,
+        head(keys[3]),
     )
-
-
-class StaticViews(NamedTuple):
-    """Key-frames at points. features: (V, U, P) per view. weights: (V, P) trust. summary: (P, SUMMARIES)."""
-
-    features: jax.Array
-    weights: jax.Array
-    summary: jax.Array
 
 
 def static_views(samples, shift, times):
@@ -84,7 +57,7 @@ def static_views(samples, shift, times):
       times: (V,) frames between the view and the target.
 
     Returns:
-      `StaticViews`.
+      `heads.ViewFeatures`, with weights of trust.
     """
     agree, behind = on_surface(samples.gap), hidden_behind(samples.gap)
     weights = samples.visible * (1 - samples.moving) * (1 - behind)
@@ -104,20 +77,18 @@ def static_views(samples, shift, times):
     total = added(weights[v] for v in views) / len(views)
     best = added(weights[v] / (1 + shift[v]) for v in views) / len(views)
     summary = jnp.concatenate([spread, total[None], best[None]], 0).T
-    return jax.lax.stop_gradient(StaticViews(features, weights, summary))
+    return jax.lax.stop_gradient(ViewFeatures(features, weights, summary))
 
 
-def static_field(params, point, direction, volume, samples, views, *, conditioning="multiply"):
+def static_field(params: StaticParams, point, direction, reading: Reading, *, modulation="multiply") -> StaticSample:
     """Density, colour and blend of P points.
 
     Args:
       params: `StaticParams`.
       point: (P, n) encoded position.
       direction: (P, Q) encoded.
-      volume: (P, C) looked up in the geometry volume; C may be 0.
-      samples: `ViewSamples` of the key-frames, or None without them.
-      views: `StaticViews` for a blend head, or None: colours and visibility are then concatenated.
-      conditioning: see `trunk`.
+      reading: what the field's head reads of the points, see `heads`.
+      modulation: see `trunk`.
 
     Returns:
       `StaticSample`.
@@ -125,27 +96,8 @@ def static_field(params, point, direction, volume, samples, views, *, conditioni
     Source: ZeST-NeRF eq. 4.
     Differs from the reference: with a blend head the colour is a softmax over the key-frames' own colours.
     """
-    lift = None if views is None else lifted(params.views, views.features)
-    if views is None:
-        condition = concatenated(volume, samples)
-    else:
-        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
-    state = trunk(params.trunk, point, condition, conditioning=conditioning)
-    if views is not None:
-        scores = view_scores(params.views, lift, state)
-        colour = blend_of_views(scores, views.weights, samples.visible, samples.colour)
-        residual = direct_colour(params.colour, state, direction) - 0.5
-        colour = jnp.clip(colour + RESIDUAL * residual, 0, 1)
-    else:
-        colour = direct_colour(params.colour, state, direction)
+    state = trunk(params.trunk, point, reading.condition, modulation=modulation)
+    colour = reading.colour(state, direction)
     density = 4 * jax.nn.softplus(raised(dense(params.density, state))[:, 0])
     logit = raised(dense(params.blend, state))[:, 0]
     return StaticSample(density, colour, jax.nn.sigmoid(logit), logit)
-
-
-def concatenated(volume, samples):
-    """(P, C + 4 V): volume features, then every view's colour and visibility bit, as the paper conditions."""
-    if samples is None:
-        return volume if volume.shape[-1] else jnp.ones((volume.shape[0], 1), volume.dtype)
-    per_view = jnp.concatenate([samples.colour, samples.visible[:, None]], axis=1)
-    return jnp.concatenate([volume, per_view.reshape(-1, per_view.shape[-1]).T], axis=-1)

@@ -8,9 +8,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.checks import check_option
+from zestjax.base.checks import check_option
 from zestjax.fields.conditioning import added
 from zestjax.nets.layers import Dense, dense, init_dense, lowered, raised
+
+MODULATIONS = ("multiply", "add")
+SCORE_LIMIT = 8.0  # of a view's logit either way: exp stays finite without looking for the largest of the views
 
 
 class Trunk(NamedTuple):
@@ -46,14 +49,14 @@ def init_trunk(key, n_in, n_condition, *, width, depth):
     return Trunk(layers, condition._replace(bias=jnp.ones_like(condition.bias)))
 
 
-def trunk(params, x, condition, *, conditioning="multiply"):
+def trunk(params, x, condition, *, modulation="multiply"):
     """Hidden state of each point: relu(layer(h) * condition), layer by layer.
 
     Args:
       params: `Trunk`.
       x: (P, n) encoded position.
       condition: (P, F).
-      conditioning: `multiply`, or `add` as the paper prints it.
+      modulation: how the condition acts on the state: `multiply`, or `add` as the paper prints it.
 
     Returns:
       (P, width).
@@ -61,14 +64,14 @@ def trunk(params, x, condition, *, conditioning="multiply"):
     Source: ZeST-NeRF appendix, MLP table.
     Reference: ZeST-NeRF networks.py; MVSNeRF models.py (multiplies).
     """
-    check_option("trunk", conditioning=(conditioning, ("multiply", "add")))
-    modulation = dense(params.condition, condition)
+    check_option("trunk", modulation=(modulation, MODULATIONS))
+    given = dense(params.condition, condition)
     hidden = x = lowered(x, params.condition.kernel)
     for layer in params.layers:
         if layer.kernel.shape[0] > hidden.shape[-1]:
             hidden = jnp.concatenate([x, hidden], axis=-1)
         hidden = dense(layer, hidden)
-        hidden = jax.nn.relu(hidden * modulation if conditioning == "multiply" else hidden + modulation)
+        hidden = jax.nn.relu(hidden * given if modulation == "multiply" else hidden + given)
     return hidden
 
 
@@ -125,7 +128,7 @@ def blend_of_views(scores, prior, visible, colour):
     Returns:
       (P, 3); 0 where no view sees the point.
     """
-    scores = 8 * jnp.tanh(scores / 8)  # bounded, so that no maximum over views is needed
+    scores = SCORE_LIMIT * jnp.tanh(scores / SCORE_LIMIT)
     weights = jnp.exp(scores) * (prior + 1e-4) * visible
     views = range(weights.shape[0])
     total = added(weights[v] for v in views)

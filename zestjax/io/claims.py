@@ -6,6 +6,9 @@ claim   (height, width) in pixels; where a header may state several, the largest
 import struct
 
 JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # kinds of the segment that has a JPEG's size
+PNG = b"\x89PNG\r\n\x1a\n"
+PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by kind of colour
+DEFLATED = 1032  # times its size is the most that a deflated stream, such as a PNG's, can hold
 LONE = tuple(bytes([kind]) for kind in (0, 1, *range(0xD0, 0xD9)))  # kinds that nothing follows, no length either
 TIFF_SIZES = {257: 0, 256: 1, 323: 0, 322: 1}  # tag -> axis: of the picture, and of the tiles that it is stored in
 TIFF_TYPES = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "q"}  # of whole numbers
@@ -18,6 +21,14 @@ def claimed_size(content):
         return None if read is None else read(content)
     except struct.error:  # too short
         return None
+
+
+def most_pixels(content):
+    """Most pixels that these bytes can hold, where the format bounds them by its length; else None."""
+    if not content.startswith(PNG) or len(content) < 26:
+        return None
+    bits = max(1, content[24]) * PNG_CHANNELS.get(content[25], 1)
+    return DEFLATED * 8 * len(content) // bits
 
 
 def _png(content):
@@ -79,7 +90,7 @@ def _tiff(content):
 
 
 FORMATS = {
-    b"\x89PNG\r\n\x1a\n": _png, b"\xff\xd8\xff": _jpeg, b"BM": _bmp, b"RIFF": _webp,
+    PNG: _png, b"\xff\xd8\xff": _jpeg, b"BM": _bmp, b"RIFF": _webp,
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), _tiff),
 }  # fmt: skip
 """By how a file begins: what reads its claim, or raises `struct.error` where it is too short."""

@@ -9,7 +9,7 @@ import cv2
 import matplotlib
 import numpy as np
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
 from zestjax.io.pictures import to_bytes
 
 

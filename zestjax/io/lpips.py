@@ -17,7 +17,7 @@ from zestjax.io.archives import ArchiveError, is_gzip, read_member
 from zestjax.io.array_pickles import ArrayPickleError, read_array_pickle
 from zestjax.io.torch_files import read_named_arrays
 from zestjax.io.weights import WeightsError, load_weights, save_weights
-from zestjax.lpips import LpipsParams, lpips_like
+from zestjax.judge.lpips import LpipsParams, lpips_like
 from zestjax.nets.layers import Conv
 
 FEATURES = (0, 3, 6, 8, 10)  # torchvision's numbers of the convolutions

@@ -9,16 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.checks import check_option
+from zestjax.base.checks import check_option
 from zestjax.fields.trunk import ColourHead, Trunk
 from zestjax.io.torch_files import read_named_arrays
 from zestjax.io.weights import WeightsError
-from zestjax.mvsnerf import MvsNerfField, MvsNerfParams, init_mvsnerf
 from zestjax.nets.cost_regulariser import CostRegulariser
 from zestjax.nets.feature_pyramid import FeaturePyramid
 from zestjax.nets.layers import Block, Conv, Dense, Norm, Statistics
+from zestjax.systems.mvsnerf import STATISTICS, MvsNerf, MvsNerfField, MvsNerfParams
 
-STATISTICS = ("batch", "stored")
 REMEDY = "give MVSNeRF's released checkpoint (mvsnerf-v0)."
 PARTS = {"fn": "network_fn_state_dict", "mvs": "network_mvs_state_dict"}
 
@@ -53,11 +52,7 @@ def read_mvsnerf(path, *, statistics="batch"):
 
 def mvsnerf_like(*, statistics="batch"):
     """Shapes and types of `read_mvsnerf`'s result."""
-    like = jax.eval_shape(lambda: init_mvsnerf(jax.random.key(0)))
-    if statistics == "batch":
-        return like
-    norm = lambda x: x._replace(statistics=Statistics(x.scale, x.scale)) if isinstance(x, Norm) else x
-    return jax.tree.map(norm, like, is_leaf=lambda x: isinstance(x, Norm))
+    return jax.eval_shape(MvsNerf(statistics=statistics).init, jax.random.key(0))
 
 
 def _published(path):

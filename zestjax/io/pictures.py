@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from zestjax.io.claims import claimed_size
+from zestjax.io.claims import claimed_size, most_pixels
 from zestjax.io.files import write_bytes
 from zestjax.io.reading import FileWarning, read_regular, silenced_stderr
 
@@ -218,6 +218,8 @@ def _check_claim(path, content):
             f"{path}: claims {claim[0]}x{claim[1]} pixels (HxW), more than the {MOST_PIXELS:,} that are read; "
             "give a smaller one."
         )
+    if (most := most_pixels(content)) is not None and claim[0] * claim[1] > most:
+        raise ValueError(f"{path}: {UNREADABLE}")
 
 
 def _doubt(share):

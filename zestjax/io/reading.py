@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from zestjax.checks import pose_hint
+from zestjax.base.checks import pose_hint
 
 MOST_BYTES = 2**30  # of a file: a depth map and a flow of 8K have 400 MB
 CHUNK = 2**20  # bytes

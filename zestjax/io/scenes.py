@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
+from zestjax.base.checks import check_option
 from zestjax.cameras import Camera, resized
-from zestjax.checks import check_option
-from zestjax.inputs import check_inputs
+from zestjax.frames.inputs import check_inputs
 from zestjax.io.idr import is_idr, read_idr
 from zestjax.io.layouts import select
 from zestjax.io.llff import is_llff, read_llff

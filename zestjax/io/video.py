@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
 from zestjax.io.files import write_bytes
 from zestjax.io.pictures import to_bytes
 from zestjax.io.reading import silenced_stderr

@@ -78,13 +78,14 @@ def _plain(value, place="metadata", kinds=(dict,)):
     return {key: _plain(entry, f"{place}[{key!r}]", JSON) for key, entry in value.items()}
 
 
-def load_weights(path, *, like=None):
+def load_weights(path, *, like=None, renamed=None):
     """Read what `save_weights` wrote.
 
     Args:
       path: the file.
       like: tree of arrays or `jax.ShapeDtypeStruct`s of the wanted structure, shapes and types; None returns a flat
         dict from leaf path to numpy array instead.
+      renamed: function from the name of a stored leaf to its name in `like`, for files of an earlier version.
 
     Returns:
       (params, metadata): the tree of jax arrays with the structure of `like`, and the dict given to `save_weights`.
@@ -94,6 +95,8 @@ def load_weights(path, *, like=None):
       WeightsError: no such file; or its leaves are not those of `like` (all differences are listed).
     """
     arrays, metadata = _read(Path(path))
+    if renamed is not None:
+        arrays = {renamed(name): array for name, array in arrays.items()}
     if like is None:
         return arrays, metadata
     wanted = _named_leaves(like)

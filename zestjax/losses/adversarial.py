@@ -9,9 +9,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
+from zestjax.base.numerics import safe_divide
 from zestjax.nets.layers import Conv, Norm, conv2d, init_conv2d, init_norm, norm_act
-from zestjax.numerics import safe_divide
 
 SLOPE = 0.2  # of the leaky rectifiers
 

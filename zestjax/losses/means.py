@@ -11,8 +11,8 @@ released code, so that the published weights keep their meaning.
 
 import jax.numpy as jnp
 
-from zestjax.checks import check_option
-from zestjax.numerics import masked_mean
+from zestjax.base.checks import check_option
+from zestjax.base.numerics import masked_mean
 
 NORMS = {"absolute": jnp.abs, "squared": jnp.square}
 NORMALISERS = ("count", "confidence")

@@ -7,7 +7,7 @@ M           neighbouring times that the scene is warped from
 
 import jax.numpy as jnp
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
 from zestjax.losses.means import mean_over_valid
 
 

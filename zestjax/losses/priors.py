@@ -7,7 +7,7 @@ valid    in [0, 1]; 0 leaves a pixel out
 
 import jax.numpy as jnp
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
 from zestjax.depth import FLAT, whitened
 from zestjax.losses.means import mean_over_valid
 

@@ -9,7 +9,7 @@ weights     (..., S)  from `rendering`
 import jax
 import jax.numpy as jnp
 
-from zestjax.checks import check_option, check_shapes
+from zestjax.base.checks import check_option, check_shapes
 from zestjax.losses.means import mean_over_valid
 
 LEAST = 1e-7  # a probability under which its logarithm is held

@@ -10,9 +10,9 @@ Convert flows from frustum units with `flow.world_flow` first.
 
 import jax.numpy as jnp
 
-from zestjax.checks import check_option, check_shapes
+from zestjax.base.checks import check_option, check_shapes
+from zestjax.base.numerics import safe_norm
 from zestjax.losses.means import mean_over_valid
-from zestjax.numerics import safe_norm
 
 
 def cycle_loss(flow_there, flow_back, confidence, *, valid=None, norm="absolute", normalise="count"):

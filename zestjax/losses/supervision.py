@@ -6,7 +6,7 @@ valid    in [0, 1]; 0 where there is no answer
 
 import jax.numpy as jnp
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
 from zestjax.losses.means import mean_over_valid, spread_mask
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from zestjax.checks import check_option, check_shapes
+from zestjax.base.checks import check_option, check_shapes
 
 VOLUMES = ("NDHWC", "DHWIO", "NDHWC")
 IMAGES = ("NHWC", "HWIO", "NHWC")

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
 from zestjax.nets.conv3d import conv3d, conv3d_transpose
 from zestjax.nets.layers import Block, Dense, dense, init_block3d, init_dense, lowered, norm_act, raised
 

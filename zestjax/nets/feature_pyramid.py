@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.checks import check_option, check_shapes
+from zestjax.base.checks import check_option, check_shapes
 from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d, raised
 
 STRIDES = (1, 1, 2, 1, 1, 2, 1, 1)

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from zestjax.checks import check_option, check_shapes
+from zestjax.base.checks import check_option, check_shapes
+from zestjax.base.numerics import matmul
 from zestjax.nets.conv2d import convolve2d
-from zestjax.numerics import matmul
 
 FEW_ROWS = 4096  # of a norm's statistics
 

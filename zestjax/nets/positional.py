@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from zestjax.checks import check_option
+from zestjax.base.checks import check_option
 from zestjax.nets.layers import raised
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
 from zestjax.nets.conv2d import doubled_convolve2d
 from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d, norm_act, raised
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from zestjax.checks import check_option
+from zestjax.base.checks import check_option
 from zestjax.simulate import props, rigs
 from zestjax.simulate.layout import Layout
 from zestjax.simulate.textures import random_atlas

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.numerics import safe_divide
+from zestjax.base.numerics import safe_divide
 from zestjax.resample import bilinear
 from zestjax.simulate.clips import take_camera, without_noise
 from zestjax.simulate.render import render

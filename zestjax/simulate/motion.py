@@ -7,7 +7,7 @@ joint    the rigid frame a body hangs in; a body's own stretch is not passed on 
 import jax
 import jax.numpy as jnp
 
-from zestjax.numerics import matmul, matvec
+from zestjax.base.numerics import matmul, matvec
 
 CHAIN = 4  # the longest chain of parents
 

@@ -7,8 +7,8 @@ S        samples along each side of a pixel
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.numerics import matmul
 from zestjax.cameras import intrinsics_inverse, rigid_inverse
-from zestjax.numerics import matmul
 from zestjax.simulate.cast import Placed, along, nearest_hit
 from zestjax.simulate.motion import affine_inverse, all_bodies, world_from_bodies
 from zestjax.simulate.shade import shaded

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.numerics import matvec
 from zestjax.cameras import project
-from zestjax.numerics import matvec
 from zestjax.simulate.cast import nearest_hit
 from zestjax.simulate.motion import all_bodies, carried, movement
 from zestjax.simulate.render import placed_bodies

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.backend import FLAG, LARGEST_ERROR, REMEDY, sum_error
+from zestjax.base.backend import FLAG, LARGEST_ERROR, REMEDY, sum_error
 
 SECONDS = 120  # a program that hangs is a fault, too; a sound one takes two
 HIGH_RANK = """

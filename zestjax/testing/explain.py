@@ -7,6 +7,7 @@ group  parameters that share the first steps of their path in the tree
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from zestjax.testing.origin import Origin, find_origin
@@ -41,6 +42,8 @@ class Explanation(NamedTuple):
 def explain_gradient(losses, params, *, depth=1):
     """Value and gradient norms of every term by group, and the origin of what is not finite.
 
+    One program is compiled for all terms; each that is not finite in it is asked once more, alone.
+
     Args:
       losses: `losses(params)` gives scalars by name: a dict, or a NamedTuple of which entries may be None.
       params: pytree of floating-point arrays.
@@ -59,16 +62,47 @@ def explain_gradient(losses, params, *, depth=1):
         raise ValueError(f"explain_gradient: `losses` should give scalars by name, got {got}.")
     paths = [jax.tree_util.keystr(p[:depth]) or "all" for p, _ in jax.tree_util.tree_leaves_with_path(params)]
     groups, values, norms, origin = tuple(dict.fromkeys(paths)), [], [], None
-    for term in shapes:
-        value, grads = jax.jit(jax.value_and_grad(lambda p, term=term: named(p)[term]))(params)
-        squares = dict.fromkeys(groups, 0.0)
-        for group, leaf in zip(paths, jax.tree.leaves(grads), strict=True):
-            squares[group] += float(np.sum(np.square(np.asarray(leaf, np.float64))))
+    found = _gradients(named, tuple(shapes), params)
+    for i, term in enumerate(shapes):
+        one = lambda p, term=term: named(p)[term]
+        value, leaves = found[0][term], [leaf[i] for leaf in found[1]]
+        if not _finite(value, leaves):  # another term's infinity times this one's 0 may have spoilt it: ask it alone
+            value, grads = jax.jit(jax.value_and_grad(one))(params)
+            leaves = list(map(np.asarray, jax.tree.leaves(grads)))
+        if origin is None and not _finite(value, leaves):
+            origin = find_origin(one, params, term)
         values.append(float(value))
-        norms.append([squares[group] ** 0.5 for group in groups])
-        if origin is None and not np.isfinite([values[-1], *norms[-1]]).all():
-            origin = find_origin(lambda p, term=term: named(p)[term], params, term)
+        norms.append([_norm(leaves, paths, group) for group in groups])
     return Explanation(tuple(shapes), groups, np.array(values), np.array(norms), origin)
+
+
+def _gradients(named, terms, params):
+    """(values by term, leaves of the gradient with the terms as leading axis), by one program: one forward pass."""
+
+    @jax.jit
+    def both(params):
+        values, pull = jax.vjp(named, params)
+        chosen = lambda i: {name: jnp.where(i == k, 1, 0).astype(values[name].dtype) for k, name in enumerate(terms)}
+        return values, jax.lax.map(lambda i: pull(chosen(i))[0], jnp.arange(len(terms)))
+
+    values, grads = both(params)
+    return values, [np.asarray(leaf) for leaf in jax.tree.leaves(grads)]
+
+
+def _finite(value, leaves):
+    return all(np.isfinite(np.asarray(x, np.float64)).all() for x in (value, *leaves))
+
+
+def _norm(leaves, paths, group):
+    """Euclidean norm of the leaves of a group."""
+    return (
+        sum(
+            float(np.sum(np.square(np.asarray(x, np.float64))))
+            for x, p in zip(leaves, paths, strict=True)
+            if p == group
+        )
+        ** 0.5
+    )
 
 
 def _named(losses):

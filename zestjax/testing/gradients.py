@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.testing.raised import is_float, raised, wide
 from zestjax.testing.walk import contains, program, run
 
 UNSEEN = ("while", "cond")  # what is inside them is not held
@@ -80,15 +81,18 @@ def _branches(equation):
     return [*params.get("branches", ()), *(params[n] for n in ("cond_jaxpr", "body_jaxpr") if n in params)]
 
 
-def assert_grads_match(fn, *args, step=1e-6, directions=3, rtol=1e-5, atol=1e-7, seed=0):
+def assert_grads_match(fn, *args, constant=(), step=1e-6, directions=3, rtol=1e-5, atol=1e-7, seed=0):
     """The gradient of a random mix of a function's outputs is its slope, by central differences in float64.
 
-    Arguments are raised to float64 for the check, whatever they are, and 64 bits are switched on for it alone. What
-    passes a `stop_gradient` is held while the arguments move, as its gradient does.
+    The function is traced as it is, and its program, with what it closes over and casts to, is run in float64 (see
+    `raised`); 64 bits are switched on for that alone. What passes a `stop_gradient` is held while the arguments move,
+    as its gradient does.
 
     Args:
-      fn: any function over pytrees of floating-point arrays.
-      *args: where it is asked. Keep away from kinks (the corner of an absolute value), where no slope exists.
+      fn: any function over pytrees of arrays; what it gives that is no floating-point number is not looked at.
+      *args: where it is asked. Their floating-point leaves move. Keep away from kinks (the corner of an absolute
+        value), where no slope exists.
+      constant: arguments that follow these, such as a batch or a PRNG key; nothing in them moves.
       step: of the differences, in units of the arguments.
       directions: random directions in which slopes are compared.
       rtol: tolerance, relative.
@@ -97,21 +101,45 @@ def assert_grads_match(fn, *args, step=1e-6, directions=3, rtol=1e-5, atol=1e-7,
 
     Raises:
       AssertionError: a slope disagrees; gives both.
+      ValueError: no argument has a floating-point leaf.
+      NotImplementedError: what cannot be held or raised, with its line.
     """
+    rng = np.random.default_rng(seed)
+    draw = lambda x: rng.normal(size=np.shape(x))
+    outputs, point, fixed = _of_floats(fn, args, tuple(constant))
+    if not point:
+        raise ValueError("assert_grads_match: no argument has a floating-point leaf, expected one that can move.")
+    mix = [draw(s).astype(s.dtype) for s in jax.eval_shape(outputs, point, fixed)]
+    pull = raised(lambda point, fixed, mix: jax.vjp(lambda p: outputs(p, fixed), point)[1](mix)[0], point, fixed, mix)
+    values = raised(outputs, point, fixed)
     with jax.enable_x64(True):
-        rng = np.random.default_rng(seed)
-        args = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float64), args)
-        draw = lambda x: jnp.asarray(rng.normal(size=x.shape))
-        mix = jax.tree.map(draw, jax.eval_shape(fn, *args))
-        weigh = lambda out: sum(jax.tree.leaves(jax.tree.map(lambda w, x: jnp.sum(w * x), mix, out)))
-        still = held(fn, *args)
-        moved = lambda t, way: jax.tree.map(lambda x, d: x + t * d, args, way)
-        value = jax.jit(lambda t, way: weigh(still(*moved(t, way))))
-        slope = jax.jit(lambda way: jax.grad(lambda t: weigh(fn(*moved(t, way))))(jnp.float64(0)))
+        point, fixed, mix = wide((point, fixed, mix))
+        still = held(values, point, fixed)
+        moved = lambda t, way: [x + t * d for x, d in zip(point, way, strict=True)]
+        value = jax.jit(lambda t, way: _dot(mix, still(moved(t, way), fixed)))
+        gradient = jax.jit(pull)(point, fixed, mix)
         for _ in range(directions):
-            way = jax.tree.map(draw, args)
+            way = [jnp.asarray(draw(x)) for x in point]
             numeric = (value(jnp.float64(step), way) - value(jnp.float64(-step), way)) / (2 * step)
             np.testing.assert_allclose(
-                slope(way), numeric, rtol=rtol, atol=atol,
+                _dot(gradient, way), numeric, rtol=rtol, atol=atol,
                 err_msg="assert_grads_match: the gradient (first) is not the slope of central differences (second)",
             )  # fmt: skip
+
+
+def _of_floats(fn, args, constant):
+    """(`outputs(point, fixed) -> [floating-point outputs]`, floating-point leaves of the arguments, what stays)."""
+    leaves, tree = jax.tree.flatten(args)
+    moves = [is_float(x) for x in leaves]
+    point, still = ([x for x, m in zip(leaves, moves, strict=True) if m is kind] for kind in (True, False))
+
+    def outputs(point, fixed):
+        point, still, constant = iter(point), iter(fixed[0]), fixed[1]
+        args = jax.tree.unflatten(tree, [next(point if m else still) for m in moves])
+        return [x for x in map(jnp.asarray, jax.tree.leaves(fn(*args, *constant))) if is_float(x)]
+
+    return outputs, point, (still, constant)
+
+
+def _dot(a, b):
+    return sum(jnp.sum(x * y) for x, y in zip(a, b, strict=True))

@@ -40,14 +40,17 @@ def run(closed, leaves, visit, *, taken=False):
 
 def contains(closed, name):
     """Whether a primitive of this name is anywhere in a program."""
-    return any(e.primitive.name == name or any(contains(j, name) for j in _inner(e)) for e in _jaxpr(closed).eqns)
+    return any(
+        e.primitive.name == name or any(contains(j, name) for j in inner_programs(e)) for e in _jaxpr(closed).eqns
+    )
 
 
 def _jaxpr(program):
     return program.jaxpr if isinstance(program, ClosedJaxpr) else program
 
 
-def _inner(equation):
+def inner_programs(equation):
+    """Programs that an operation holds: of what it calls, of its branches, of a loop's condition and turn."""
     values = [equation.params[name] for name in INNER if name in equation.params]
     return values + list(equation.params.get("branches", ())) + [
         equation.params[name] for name in ("cond_jaxpr", "body_jaxpr") if name in equation.params
@@ -67,7 +70,7 @@ def _run(program, leaves, visit, taken):
 def _outputs(equation, inputs, visit, taken):
     name, params = equation.primitive.name, equation.params
     within = lambda inside, inputs, outputs: visit(_placed(inside, equation), inputs, outputs)
-    if name in INLINED and (inner := _inner(equation)):
+    if name in INLINED and (inner := inner_programs(equation)):
         return _run(inner[0], inputs, within, taken)
     if name == "scan":
         return _scan(equation, inputs, within, taken)

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.checks import check_shapes
+from zestjax.base.numerics import safe_divide, safe_norm
 from zestjax.cameras import Camera, centre
-from zestjax.checks import check_shapes
-from zestjax.numerics import safe_divide, safe_norm
 from zestjax.planesweep import homographies, plane_depths, warp
 
 SLOTS = (-2, -1, 0, 1, 2)

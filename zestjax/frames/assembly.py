@@ -11,24 +11,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.cameras import Camera
-from zestjax.evidence import Evidence, Neighbours, Sources, frame_evidence, half_images
-from zestjax.model import Frames, Inputs
-from zestjax.optical_flow import VideoFlow, video_flow
-from zestjax.selection import Chosen, key_frames, slots
+from zestjax.base.checks import traced
+from zestjax.frames.cells import half_images
+from zestjax.frames.evidence import Evidence, Neighbours, Sources, frame_evidence
+from zestjax.frames.optical_flow import VideoFlow, video_flow
+from zestjax.frames.selection import Chosen, key_frames, slots
 
 EVIDENCE_SOURCES = 8
 
 
 def positions(cameras):
-    """(N, 3) optical centres of host cameras, numpy."""
-    pose = np.asarray(cameras.camera_from_world)
-    return -np.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3])
+    """(N, 3) optical centres: numpy of cameras on the host, JAX's where they are traced."""
+    xp = jnp if traced(cameras) else np
+    pose = xp.asarray(cameras.camera_from_world)
+    return -xp.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3])
 
 
 def taken(cameras, frames):
     """`Camera` of the chosen frames."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[frames], cameras)
+    xp = jnp if traced((cameras, frames)) else np
+    return jax.tree.map(lambda leaf: xp.asarray(leaf)[frames], cameras)
 
 
 class Footage(NamedTuple):
@@ -101,39 +103,3 @@ def dequantised(evidence):
     A product: compiled, a division by a constant becomes one too, and would round otherwise than uncompiled.
     """
     return jax.tree.map(lambda x: x.astype(jnp.float32) * np.float32(1 / 255), evidence)
-
-
-def target_inputs(images, cameras, near, far, camera, time, *, config, exclude=()):
-    """`Inputs` of a target, and which frames they hold.
-
-    Args:
-      images: (N, H, W, 3) uint8 or float32, host or device.
-      cameras: `Camera` (N, ...) on the host.
-      near: world units.
-      far: world units.
-      camera: the target's `Camera`.
-      time: int frame time.
-      config: `presets.Config`.
-      exclude: see the header.
-
-    Returns:
-      (`Inputs`, (K + M,) int frames).
-    """
-    count = len(images)
-    centre = positions(jax.tree.map(lambda leaf: np.asarray(leaf)[None], camera))[0]
-    chosen = key_frames(
-        positions(cameras), config.key_frames, target=centre, time=time, choice=config.key_frame_choice, exclude=exclude
-    )
-    around = slots(count, time, offsets=config.slots, exclude=exclude)
-
-    def pack(c):
-        return Frames(
-            colours_of(jnp.asarray(images[c.frames])), taken(cameras, c.frames), c.valid, c.frames.astype(np.float32)
-        )
-
-    inputs = Inputs(
-        pack(chosen), pack(around)._replace(times=np.float32(time) + np.asarray(config.slots, np.float32)),
-        Camera(*(jnp.asarray(x, jnp.float32) for x in camera)),
-        np.float32(time), np.float32(count), np.float32(near), np.float32(far),
-    )  # fmt: skip
-    return inputs, np.concatenate([chosen.frames, around.frames])

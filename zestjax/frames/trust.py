@@ -13,8 +13,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.checks import check_shapes
 from zestjax.cameras import project
-from zestjax.checks import check_shapes
 from zestjax.resample import bilinear
 
 FARTHEST = 10  # tolerances: beyond, exp(-x^2) is 0 in float32, while x^2 and d x / d tolerance may overflow

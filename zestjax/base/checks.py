@@ -81,6 +81,11 @@ def check_types(where, /, **values):
             raise ValueError(f"{where}: `{name}` should be a `{wanted.__name__}`, got `{type(value).__name__}`.")
 
 
+def traced(tree):
+    """Whether anything of a tree has no values yet, because JAX is tracing it."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def check_known(where, /, **trees):
     """Refuse what has no values yet because it is being traced, where a choice depends on the values.
 
@@ -88,8 +93,19 @@ def check_known(where, /, **trees):
       ValueError: naming the function and the argument.
     """
     for name, tree in trees.items():
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
+        if traced(tree):
             raise ValueError(
-                f"{where}: `{name}` is traced, expected an array with values, by which frames are chosen on the host; "
-                "call it outside `jit`, `grad` and `vmap`."
+                f"{where}: `{name}` is traced, expected an array with values: this is done on the host; call it "
+                "outside `jit`, `grad` and `vmap`."
             )
+
+
+def check_counts(where, /, **counts):
+    """Refuse what is no whole number of a range: `check_counts("Space", planes=(planes, 2, 512))`.
+
+    Raises:
+      ValueError: naming the function, the argument, its value and the range.
+    """
+    for name, (value, least, most) in counts.items():
+        if type(value) is not int or not least <= value <= most:
+            raise ValueError(f"{where}: `{name}` is {value!r}, expected an integer from {least} to {most}.")

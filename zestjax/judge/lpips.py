@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from zestjax.checks import check_shapes
+from zestjax.base.checks import check_shapes
+from zestjax.base.numerics import safe_norm
 from zestjax.metrics import mean_where
 from zestjax.nets.layers import Conv
-from zestjax.numerics import safe_norm
 
 LAYERS = ((11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256))
 STRIDES, PADDING = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)

@@ -6,7 +6,7 @@ step   () int from 0: the number of updates already made. A Python int, or an ar
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.checks import check_option
+from zestjax.base.checks import check_option
 
 PRIORS = ("geo", "depth")
 
@@ -44,16 +44,16 @@ def decayed_priors(weights, step, *, decay, shape="staircase", end=None, terms=P
     Reference: ZeST-NeRF train.py: a factor of ten less every `decay` steps, never 0.
 
     Args:
-      weights: `Terms` of numbers; None and the Python number 0 stay as they are.
+      weights: mapping of numbers; None and the Python number 0 stay as they are.
       step: () int. With a Python int the weights are Python floats, and from `end` on the Python number 0,
         which takes the term out of the compiled program.
       decay: steps over which a prior's weight falls to a tenth, > 0.
       shape: "staircase" (as published) or "smooth", the exponential through its corners.
       end: step from which the priors' weights are exactly 0; None is never.
-      terms: names of the fields of `weights` that fade.
+      terms: names of the weights that fade, those that there are.
 
     Returns:
-      `Terms` like `weights`.
+      A dict like `weights`.
 
     Raises:
       ValueError: if `shape` is unknown or `decay` not positive.
@@ -71,4 +71,4 @@ def decayed_priors(weights, step, *, decay, shape="staircase", end=None, terms=P
     fade = lambda weight: (
         weight if weight is None or (isinstance(weight, int | float) and not weight) else weight * factor
     )
-    return weights._replace(**{name: fade(getattr(weights, name)) for name in terms})
+    return {name: fade(weight) if name in terms else weight for name, weight in weights.items()}

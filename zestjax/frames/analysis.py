@@ -15,7 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.evidence import FLOW_CHANNELS
+from zestjax.base.checks import check_counts
+from zestjax.base.parts import part
+from zestjax.frames.evidence import FLOW_CHANNELS, Evidence
 from zestjax.nets.layers import raised
 from zestjax.nets.unet2d import UNet2d, init_unet2d, unet2d
 
@@ -28,6 +30,7 @@ STATIC_AROUND = 3  # of the costs, the static one averaged over its surroundings
 STANDING = (0.25, 0.5)  # static costs above which a cell is taken to be what moves, when looking for what it stands on
 MOVING_PARTS = 4  # a mask value for each half-resolution pixel of a cell
 NEVER = -30.0  # logit of moving where nothing does
+MOST_PLANES, MOST_WIDTH, MOST_LEVELS = 512, 4096, 8  # of a network that fits a machine, whoever wrote its file
 
 
 class AnalysisParams(NamedTuple):
@@ -39,25 +42,43 @@ class AnalysisParams(NamedTuple):
 class FrameMaps(NamedTuple):
     """What a frame tells about itself; the cache of a scene.
 
-    features: (V, h, w, C) learned, without range.
     logits: (V, h, w, E) of the visible surface's plane.
     coordinate: (V, h, w) plane coordinate of the visible surface, in [0, 1].
     tolerance: (V, h, w) its uncertainty, > 0, in plane coordinates.
     moving_logits: (V, 2h, 2w) of the pixel showing something that moves.
     """
 
-    features: jax.Array
     logits: jax.Array
     coordinate: jax.Array
     tolerance: jax.Array
     moving_logits: jax.Array
 
 
-def init_analysis(key, *, planes, features, widths):
-    """Parameters for E planes and C features; `widths` are the U-Net's."""
+def init_analysis(key, *, planes, widths):
+    """Parameters for E planes; `widths` are the U-Net's."""
     n_in = 4 * planes + SUMMARIES + FLOW_CHANNELS + 2 + 12
-    net = init_unet2d(key, n_in, widths, 2 * planes + COSTS + 2 + MOVING_PARTS + features)
+    net = init_unet2d(key, n_in, widths, 2 * planes + COSTS + 2 + MOVING_PARTS)
     return AnalysisParams(net._replace(head=jax.tree.map(lambda x: 0.1 * x, net.head)))
+
+
+@part
+class OwnMaps:
+    """Every frame is asked for its own depth, on `planes` planes, and its moving pixels; `widths` of the U-Net."""
+
+    planes: int = 32
+    widths: tuple[int, ...] = (48, 64, 96, 128)
+
+    def __post_init__(self):
+        check_counts("OwnMaps", planes=(self.planes, 2, MOST_PLANES), levels=(len(self.widths), 1, MOST_LEVELS))
+        check_counts("OwnMaps", **{f"widths[{i}]": (n, 1, MOST_WIDTH) for i, n in enumerate(self.widths)})
+
+    def init(self, key: jax.Array) -> AnalysisParams:
+        """Parameters."""
+        return init_analysis(key, planes=self.planes, widths=self.widths)
+
+    def __call__(self, params: AnalysisParams, evidence: Evidence, *, still: bool = False) -> FrameMaps:
+        """See `frame_maps`."""
+        return frame_maps(params, evidence, still=still)
 
 
 def _costs(evidence):
@@ -112,7 +133,7 @@ def _channels(evidence, costs, ground, still):
 
 
 def frame_maps(params, evidence, *, still=False):
-    """Depth, moving pixels and features of each frame from its evidence.
+    """Depth and moving pixels of each frame from its evidence.
 
     A cell's surface stands still or moves, with the probability of its mask; either way it has a distribution over
     planes, and the two are mixed. The net says how much each cost is to be believed there, how far from the ground
@@ -133,8 +154,8 @@ def frame_maps(params, evidence, *, still=False):
     planes = costs.shape[-1]
     ground, standing = jax.lax.stop_gradient(_ground(costs))
     out = unet2d(params.net, _channels(evidence, costs, ground, standing))
-    parts = jnp.split(out, np.cumsum([planes, planes, COSTS, 1, 1, MOVING_PARTS]), axis=-1)
-    still_free, moving_free, gains, place, sharpness, moving, features = parts
+    parts = jnp.split(out, np.cumsum([planes, planes, COSTS, 1, 1]), axis=-1)
+    still_free, moving_free, gains, place, sharpness, moving = parts
     gains = jax.nn.softplus(4 * gains + math.log(math.expm1(GAIN)))
     believed = [gains[..., k : k + 1] * costs[k] for k in range(COSTS)]
     index = jnp.linspace(0, 1, planes, dtype=out.dtype).reshape(1, 1, 1, planes)
@@ -149,7 +170,7 @@ def frame_maps(params, evidence, *, still=False):
     coordinate, tolerance = plane_moments(jnp.where(moves > 0, moved, standing))
     v, h, w, _ = moving.shape
     moving = jnp.moveaxis(moving.reshape(v, h, w, 2, 2), 3, 2).reshape(v, 2 * h, 2 * w)
-    return FrameMaps(features, logits, coordinate, tolerance, moving)
+    return FrameMaps(logits, coordinate, tolerance, moving)
 
 
 def _mixed(standing, moved, moving):

@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.checks import check_shapes
+from zestjax.base.numerics import matvec, safe_norm
 from zestjax.cameras import Camera, resized
-from zestjax.checks import check_shapes
-from zestjax.numerics import matvec, safe_norm
+from zestjax.frames.cells import cell_values, pooled
 from zestjax.planesweep import homographies, plane_depths
 from zestjax.resample import bilinear
 
@@ -63,30 +64,6 @@ class Neighbours(NamedTuple):
     flow: jax.Array | np.ndarray
     sure: jax.Array | np.ndarray
     cameras: Camera
-
-
-def pooled(x, factor):
-    """Mean over factor x factor blocks of (..., H, W, C); the remainder at the right and bottom repeats the edge."""
-    height, width, channels = x.shape[-3:]
-    lead = [(0, 0)] * (x.ndim - 3)
-    x = jnp.pad(x, [*lead, (0, -height % factor), (0, -width % factor), (0, 0)], mode="edge")
-    rows, columns = x.shape[-3] // factor, x.shape[-2] // factor
-    x = x.reshape(*x.shape[:-3], rows, factor, columns, factor, channels)
-    return x.mean(axis=(-4, -2))
-
-
-def cell_values(half):
-    """Half-resolution maps (..., 2h, 2w, C) as the four values of each cell, (..., h, w, 4 C)."""
-    *lead, height, width, channels = half.shape
-    x = half.reshape(*lead, height // 2, 2, width // 2, 2, channels)
-    return jnp.moveaxis(x, -4, -3).reshape(*lead, height // 2, width // 2, 4 * channels)
-
-
-def half_images(images):
-    """Images (..., H, W, 3) at half resolution with even sizes, so that cells are whole."""
-    half = pooled(images, 2)
-    lead = [(0, 0)] * (half.ndim - 3)
-    return jnp.pad(half, [*lead, (0, half.shape[-3] % 2), (0, half.shape[-2] % 2), (0, 0)], mode="edge")
 
 
 def _grid(height, width, dtype):

@@ -1,4 +1,4 @@
-"""MVSNeRF (Chen et al. 2021) as it was published: the system whose weights show that the parts here compute the same.
+"""MVSNeRF (Chen et al. 2021) as it was published: a field and a sampler of its own make it a system like the others.
 
 It is put together from the functions that ZeST-NeRF's own form uses; what is particular to it has a keyword there
 (`legacy_abs`, `order`, `mvsnerf_cost_volume`), or is here.
@@ -8,48 +8,31 @@ padding    cells that the volume reaches beyond the reference's image on every s
 coords     (..., 3) x, y, z in [0, 1] inside the padded volume; z linear in depth
 """
 
-import dataclasses
-import functools
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from zestjax.assembly import colours_of, positions, taken
+from zestjax.base.checks import check_counts, check_option, check_shapes
+from zestjax.base.parts import part
 from zestjax.cameras import Camera, project, scaled
-from zestjax.checks import check_shapes
 from zestjax.cost_volume import mvsnerf_cost_volume, quarter_colours
-from zestjax.depth import expected_depth
+from zestjax.fields.static import StaticSample
 from zestjax.fields.trunk import ColourHead, Trunk, direct_colour, init_colour_head, init_trunk, trunk
+from zestjax.frames.selection import KeyFrames
 from zestjax.frustum import Frustum, cells_from_frustum, frustum_from_world
-from zestjax.inputs import check_exclude, check_inputs, check_view
 from zestjax.nets.cost_regulariser import CostRegulariser, cost_regulariser, init_cost_regulariser
 from zestjax.nets.feature_pyramid import FeaturePyramid, feature_pyramid, imagenet_normalised, init_feature_pyramid
-from zestjax.nets.layers import Dense, dense, init_dense
+from zestjax.nets.layers import Dense, Norm, Statistics, dense, init_dense
 from zestjax.nets.positional import positional_encoding
-from zestjax.novel_view import View
-from zestjax.numerics import matvec
 from zestjax.planesweep import homographies, plane_depths
-from zestjax.rays import pixel_grid, rays_from_pixels
-from zestjax.rendering import composite, weights_from_density
 from zestjax.resample import bilinear, trilinear
-from zestjax.selection import key_frames
+from zestjax.systems.fields import Seen, flat, gridded
+from zestjax.systems.system import Space, System
 
-LEVELS = 10
-BLOCK_RAYS = 512  # rendered together: memory does not grow with the image
-
-
-@dataclasses.dataclass(frozen=True)
-class MvsNerfConfig:
-    """The published choices. height: rows of a view where a user asks for no size. views: sources of a view.
-    planes, padding: of the volume. samples: per ray."""
-
-    name: str = "mvsnerf"
-    height: int = 256
-    views: int = 3
-    planes: int = 128
-    padding: int = 24
-    samples: int = 128
+LEVELS = 10  # octaves of a point's encoding, as published
+STATISTICS = ("batch", "stored")
+MOST_PADDING, MOST_SAMPLES = 1024, 4096  # of what fits a machine: a file of weights may not ask for more
 
 
 class MvsNerfField(NamedTuple):
@@ -82,14 +65,6 @@ class FieldOutput(NamedTuple):
 
     density: jax.Array
     colour: jax.Array
-
-
-class Rendered(NamedTuple):
-    """Of R rays. colour: (R, 3). depth: (R,) sum of weights times depths. opacity: (R,)."""
-
-    colour: jax.Array
-    depth: jax.Array
-    opacity: jax.Array
 
 
 def init_mvsnerf(key, *, views=3, width=128, depth=6):
@@ -190,98 +165,72 @@ def field(params, coords, features, direction):
     return FieldOutput(density, direct_colour(params.colour, state, direction))
 
 
-def render(params, built, sources, camera, pixels, *, depths=None, padding, samples=None):
-    """Rays through pixels of a target camera.
+@part
+class MvsNerf:
+    """MVSNeRF's field, of a scene that stands still. frames: its sources, all of which must be there. padding: see the
+    header. statistics: of the norms, of the images at hand (`batch`), as the published system always runs, or the
+    `stored` ones, which it never used."""
 
-    Args:
-      params: `MvsNerfParams`.
-      built: `volume` of the sources.
-      sources: `Sources`.
-      camera: the target's `Camera`.
-      pixels: (R, 2).
-      depths: (R, S) of the samples, or None: S even ones from near to far.
-      padding: of `built`.
-      samples: S, without `depths`.
+    frames: KeyFrames = KeyFrames(3, least=3)
+    padding: int = 24
+    statistics: str = "batch"
 
-    Returns:
-      `Rendered`.
+    def __post_init__(self):
+        check_counts("MvsNerf", padding=(self.padding, 0, MOST_PADDING))
+        check_option("MvsNerf", statistics=(self.statistics, STATISTICS))
 
-    Reference: MVSNeRF renderer.py `rendering`, `raw2alpha`: an interval's length is not part of its opacity.
+    def init(self, key: jax.Array) -> MvsNerfParams:
+        """Parameters."""
+        params = init_mvsnerf(key, views=self.frames.count)
+        if self.statistics == "batch":
+            return params
+        known = lambda x: x._replace(statistics=Statistics(0 * x.offset, x.scale)) if isinstance(x, Norm) else x
+        return jax.tree.map(known, params, is_leaf=lambda x: isinstance(x, Norm))
+
+    def encode(self, params, inputs, maps, frustum, depths):
+        """See `systems.fields.Field`."""
+        key = self.frames.of(inputs)
+        sources = Sources(key.images, key.cameras, inputs.near, inputs.far)
+        return Seen(volume(params, sources, planes=len(depths), padding=self.padding), sources)
+
+    def __call__(self, params, seen, marched, place):
+        """See `systems.fields.Field`."""
+        sources, points = seen.views, flat(marched.points)
+        coords = volume_coords(sources, points, padding=self.padding)
+        features = jnp.concatenate([look_up(seen.volume, coords), view_colours(sources, points)], axis=-1)
+        direction = jnp.repeat(marched.directions, marched.depths.shape[1], axis=0)
+        found = field(params.field, coords, features, direction)
+        none = jnp.zeros_like(found.density)
+        return gridded(StaticSample(found.density, found.colour, none, none), marched)
+
+
+@part
+class Ends:
+    """`samples` even ones, the first at near and the last at far; a density is per sample, whatever its interval.
+
+    Reference: MVSNeRF renderer.py `raw2alpha`: an interval's length is not part of its opacity.
     """
-    if depths is None:
-        depths = jnp.broadcast_to(plane_depths(sources.near, sources.far, samples), (len(pixels), samples))
-    rays = rays_from_pixels(camera, pixels)
-    points = (rays.origins[:, None] + depths[..., None] * rays.directions[:, None]).reshape(-1, 3)
-    unit = rays.directions / jnp.linalg.norm(rays.directions, axis=-1, keepdims=True)
-    turned = matvec(reference(sources).camera_from_world[:3, :3][None], unit)
-    coords = volume_coords(sources, points, padding=padding)
-    features = jnp.concatenate([look_up(built, coords), view_colours(sources, points)], axis=-1)
-    found = field(params.field, coords, features, jnp.repeat(turned, depths.shape[1], axis=0))
-    density, colour = (x.reshape(*depths.shape, *x.shape[1:]) for x in found)
-    weights = weights_from_density(density, jnp.ones(depths.shape[1:], density.dtype))
-    shown = composite(weights, colour)
-    return Rendered(shown.values, expected_depth(weights, depths, background=0.0), shown.opacity)
+
+    samples: int = 128
+
+    guided: ClassVar[bool] = False
+    fills: ClassVar[bool] = False
+
+    def __post_init__(self):
+        check_counts("Ends", samples=(self.samples, 2, MOST_SAMPLES))
+
+    def guide(self, volumes):
+        """See `systems.sampling.Sampler`."""
+        return None
+
+    def fractions(self, guides, pixels, jitter):
+        """See `systems.sampling.Sampler`; jitter is not for it."""
+        even = jnp.linspace(0, 1, self.samples, dtype=pixels.dtype)
+        return jnp.broadcast_to(even, (pixels.shape[0], self.samples))
+
+    def lengths(self, fractions, depths, inputs, norm, planes):
+        """See `systems.sampling.Sampler`."""
+        return jnp.ones_like(depths)
 
 
-def prepare(params, video, *, config, exclude=()):
-    """The `Video` on the host: nothing is known of a scene before a view is asked for; see `novel_view.prepare`.
-
-    Raises:
-      ValueError: if no view can be predicted from the video, or it has no such frame to exclude; see `zestjax.inputs`.
-    """
-    del params, config
-    video = check_inputs("mvsnerf.prepare", video, quantised=True)
-    check_exclude("mvsnerf.prepare", len(video.images), exclude)
-    return video
-
-
-def render_view(params, video, camera, time, *, config, exclude=()):
-    """A view from the sources nearest to its camera; arguments and result as of `novel_view.render_view`.
-
-    The scene is taken to stand still: `time` only settles which of two sources that are equally near is taken.
-
-    Args:
-      params: `MvsNerfParams`.
-      video: `Video`.
-      camera: the target's `Camera`.
-      time: int.
-      config: `MvsNerfConfig`.
-      exclude: frames that must not be sources.
-
-    Returns:
-      `View`, without what moves.
-
-    Raises:
-      ValueError: before anything is compiled, if the video cannot give the view (see `zestjax.inputs`); fewer sources
-        than the weights were made for, or an image size that is not a multiple of 4.
-    """
-    where = "mvsnerf.render_view"
-    video = check_inputs(where, video, quantised=True)
-    time, exclude = check_view(where, video, camera, time, exclude=exclude)
-    if (left := len(video.images) - len(exclude)) < config.views:
-        raise ValueError(f"mvsnerf: a view needs {config.views} source frames, {left} are left; give more frames.")
-    centre = positions(jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], camera))[0]
-    found = key_frames(positions(video.cameras), config.views, target=centre, time=time, exclude=exclude)
-    images = colours_of(jnp.asarray(video.images[found.frames]))
-    return _render_image(
-        params, Sources(images, taken(video.cameras, found.frames), video.near, video.far), camera, config
-    )
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def _render_image(params, sources, camera, config):
-    height, width = sources.images.shape[1:3]
-    built = volume(params, sources, planes=config.planes, padding=config.padding)
-    pixels = pixel_grid(height, width).reshape(-1, 2)
-    blocks = -(-len(pixels) // BLOCK_RAYS)
-    pixels = jnp.pad(pixels, [(0, blocks * BLOCK_RAYS - len(pixels)), (0, 0)], mode="edge")
-
-    def block(pixels):
-        return render(params, built, sources, camera, pixels, padding=config.padding, samples=config.samples)
-
-    drawn = jax.lax.map(block, pixels.reshape(blocks, BLOCK_RAYS, 2))
-    colour, depth, opacity = (
-        x.reshape(-1, *x.shape[2:])[: height * width].reshape(height, width, *x.shape[2:]) for x in drawn
-    )
-    shown = jnp.clip(colour, 0, 1)
-    return View(shown, shown, None, depth, opacity, jnp.zeros_like(depth), None)
+MVSNERF = System(Space(128, "depth", "key_frame", "strided"), MvsNerf(), None, Ends(), frames=None)

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zestjax.base.checks import check_known, check_shapes, check_types, traced
 from zestjax.cameras import Camera, check_camera
-from zestjax.checks import check_known, check_shapes, check_types
 from zestjax.video import check_video
 
 ROUNDING = 1e-9  # a gap between two views, as a share of their extent, that float64 may have made
@@ -76,8 +76,7 @@ def check_target(where, video, camera):
     Raises:
       ValueError: not one `Camera`, a degenerate one, or a blind one, whose pose is named.
     """
-    check_types(where, camera=(camera, Camera))
-    check_shapes(where, intrinsics=(camera.intrinsics, "3 3"), camera_from_world=(camera.camera_from_world, "4 4"))
+    check_one_camera(where, camera)
     check_camera(where, camera)
     pose, seen = np.asarray(camera.camera_from_world, np.float64), _sight(video, video.cameras)
     sees = lambda pose: _share(_sight(video, Camera(camera.intrinsics, pose)), seen).any()
@@ -99,19 +98,40 @@ def check_view(where, video, camera, time, *, exclude=()):
       exclude: frames that must serve nothing.
 
     Returns:
-      (time, exclude) as an int and a tuple of ints.
+      (time, exclude) as an int, or what is traced, and a tuple of ints.
 
     Raises:
-      ValueError: what `check_target` or `check_exclude` refuses, a time that is no integer or not in the video, or an
-        argument that is traced.
+      ValueError: what `check_target` or `check_exclude` refuses, or a time that is no integer or not in the video. Of
+        what is traced only types and shapes can be looked at: a camera that sees nothing renders a last resort, and
+        at a time outside the video no slot is valid.
     """
-    check_known(where, prepared=video, camera=camera, time=time)
     count = len(video.images)
-    if not _is_frame(time, count):
+    if traced(time):
+        check_shapes(where, time=(time, ""))
+        if time.dtype.kind not in "iu":
+            raise ValueError(f"{where}: `time` is a traced {time.dtype}, expected an integer, a frame of the video.")
+    elif not _is_frame(time, count):
         raise ValueError(f"{where}: `time` is {time!r}, expected {_frames(count)}.")
     exclude = check_exclude(where, count, exclude)
-    check_target(where, video, camera)
-    return int(time), exclude
+    if traced((video, camera)):
+        check_one_camera(where, camera)
+    else:
+        check_target(where, video, camera)
+    return time if traced(time) else int(time), exclude
+
+
+def check_one_camera(where, camera):
+    """Refuse what is not one `Camera`; its values need not be known.
+
+    Raises:
+      ValueError: another type, a batch, or a pose without its last row.
+    """
+    check_types(where, camera=(camera, Camera))
+    if np.ndim(camera.camera_from_world) > 2 or np.ndim(camera.intrinsics) > 2:
+        raise ValueError(
+            f"{where}: `camera` is a batch of shape {np.shape(camera.camera_from_world)}; map over it by jax.vmap."
+        )
+    check_shapes(where, intrinsics=(camera.intrinsics, "3 3"), camera_from_world=(camera.camera_from_world, "4 4"))
 
 
 def check_exclude(where, count, exclude):

@@ -9,7 +9,7 @@ its own parameters in float32 and casts them inside the step: gradients and mome
 
 import jax.numpy as jnp
 
-from zestjax.trees import tree_cast
+from zestjax.base.trees import tree_cast
 
 NETWORK = {"float32": jnp.float32, "bfloat16": jnp.bfloat16, "float64": jnp.float64}
 PRECISIONS = tuple(NETWORK)

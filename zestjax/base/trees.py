@@ -6,7 +6,7 @@ A leaf's name is its path as Python writes it: `.trunk[0].kernel`.
 import jax
 import jax.numpy as jnp
 
-from zestjax.numerics import safe_sqrt
+from zestjax.base.numerics import safe_sqrt
 
 
 def leaf_names(tree):

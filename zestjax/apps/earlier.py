@@ -1,0 +1,115 @@
+"""Weights that zestjax 0.1 wrote: their flat configuration as a recipe, and today's names of their arrays."""
+
+import dataclasses
+from typing import Any
+
+from zestjax.base.parts import from_stored
+from zestjax.fields.heads import Blend, Direct
+from zestjax.frames.analysis import OwnMaps
+from zestjax.frames.selection import KeyFrames, Slots
+from zestjax.systems import presets
+from zestjax.systems.fields import Dynamic, Static
+from zestjax.systems.mixes import Density, Opacity
+from zestjax.systems.sampling import Even, Guided
+from zestjax.systems.swept import OwnDepths, Pyramid, Swept
+from zestjax.systems.system import Space, System
+from zestjax.train.recipes import Pixels, Recipe, Rows
+
+RENAMED = {
+    ".geometry.": ".static.volume.",
+    ".motion.": ".dynamic.volume.",
+    ".static.colour.": ".static.net.head.colour.",
+    ".static.views.": ".static.net.head.views.",
+    ".static.": ".static.net.",
+    ".dynamic.colour.": ".dynamic.net.head.colour.",
+    ".dynamic.views.": ".dynamic.net.head.views.",
+    ".dynamic.motion": ".dynamic.net.early",
+    ".dynamic.": ".dynamic.net.",
+}
+"""What a name began with, and begins with now; the first that fits counts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """The fields of a configuration of 0.1, with their defaults."""
+
+    name: str
+    height: int = 144
+    width: int = 256
+    planes: int = 32
+    evidence_planes: int = 32
+    spacing: str = "inverse"
+    encoder: str = "frames"
+    features: int = 0
+    frame_widths: tuple[int, ...] = (48, 64, 96, 128)
+    volume_widths: tuple[int, ...] = (8, 16, 32)
+    key_frames: int = 8
+    key_frame_choice: str = "nearest"
+    slots: tuple[int, ...] = (-2, -1, 0, 1, 2)
+    reference: str = "target"
+    geometry: bool = True
+    motion: bool = True
+    dynamic: bool = True
+    trust: bool = True
+    hold_trust: bool = True
+    field_width: int = 48
+    field_depth: int = 3
+    point_levels: int = 2
+    view_levels: int = 1
+    sampling: str = "guided"
+    samples: int = 8
+    head: str = "blend"
+    conditioning: str = "pooled"
+    blend: str = "opacity"
+    rays: str = "rows"
+    mined_rays: int = 0
+    crop_rows: int = 16
+    ray_blocks: int = 4
+    precision: str = "float32"
+
+
+def renamed(name: str) -> str:
+    """Today's name of an array of 0.1."""
+    for before, now in RENAMED.items():
+        if name.startswith(before):
+            return now + name[len(before) :]
+    return name
+
+
+def recipe_from_config(fields: Any) -> Recipe:
+    """The recipe of a configuration of 0.1.
+
+    Args:
+      fields: of JSON; it may come from anybody.
+
+    Raises:
+      ValueError: no object, unknown or missing fields, of another type, choices that this version has not, or sizes
+        that no model has.
+    """
+    if not isinstance(fields, dict):
+        raise ValueError(f"the configuration is a {type(fields).__name__}, expected an object")
+    c: Config = from_stored({**fields, "part": "Config"}, [Config])
+    frames = c.encoder == "frames"
+    if c.encoder not in ("frames", "pyramid") or (frames and (c.features or not (c.trust and c.hold_trust))):
+        raise ValueError(f"the configuration has encoder {c.encoder!r} in a form that this version has not")
+    rays = Rows(c.crop_rows) if c.rays == "rows" else Pixels(c.crop_rows * c.width, c.mined_rays)
+    return Recipe(_system(c, frames), rays=rays, blocks=c.ray_blocks, height=c.height, width=c.width)
+
+
+def _system(c: Config, frames: bool) -> System:
+    tables = OwnDepths() if frames else Pyramid(c.features)
+    occupied = c.sampling == "guided"
+    shared: dict[str, Any] = dict(
+        volume=Swept(tables, c.volume_widths, occupied), head=Blend() if frames else Direct(), width=c.field_width,
+        depth=c.field_depth, point_levels=c.point_levels, view_levels=c.view_levels,
+    )  # fmt: skip
+    reach = 0.15 if occupied else 1.0
+    whole = System(
+        Space(c.planes, c.spacing, c.reference, "pooled" if frames else "strided"),
+        Static(KeyFrames(c.key_frames, c.key_frame_choice), **shared), Dynamic(Slots(c.slots), reach=reach, **shared),
+        Guided() if occupied else Even(c.samples), Density() if c.blend == "density" else Opacity(),
+        OwnMaps(c.evidence_planes, c.frame_widths) if frames else None, c.precision,
+    )  # fmt: skip
+    whole = whole if c.dynamic else presets.still(whole)
+    whole = whole if c.geometry else presets.without_geometry_volume(whole)
+    return whole if c.motion else presets.without_motion_volume(whole)

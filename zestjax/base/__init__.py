@@ -1,0 +1,1 @@
+"""What every module may use: checks of arguments, parts, trees, precisions, safe arithmetic, the compiler."""

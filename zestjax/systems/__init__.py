@@ -1,0 +1,1 @@
+"""Systems as values: parts, the presets made of them, and how they are trained."""

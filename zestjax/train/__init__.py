@@ -1,0 +1,1 @@
+"""Teaching a system: what is known of a target, what is measured, one objective, recipes."""

@@ -1,0 +1,74 @@
+"""A mean over blocks of data whose gradient needs one block's memory.
+
+block    an equal part of the data along the leading axis of every leaf
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import CustomVJPPrimal, SymbolicZero
+
+
+def in_blocks(loss: Callable, count: int, *, where: str = "in_blocks") -> Callable:
+    """Make a loss of a block of data the mean over `count` blocks of all the data.
+
+    The gradient in `shared` is found with the value, block by block, and kept in place of everything that a block
+    computed. `held` and the data are constants. One block is the loss itself, with a gradient in everything.
+
+    Args:
+      loss: `loss(shared, held, block) -> (value, aux)`, pure; aux: a tree of arrays.
+      count: blocks.
+      where: name used in the message.
+
+    Returns:
+      `mean(shared, held, data) -> (value, aux)`, means over the blocks. In reverse mode alone where there are several.
+
+    Raises:
+      ValueError: when called with data that has no so many equal blocks.
+    """
+    if count == 1:
+        return loss
+
+    @jax.custom_vjp
+    def mean(shared, held, data):
+        return mean_over_blocks(lambda block: loss(shared, held, block), split(data))
+
+    def forward(shared, held, data):
+        shared, held, data = jax.tree.map(lambda primal: primal.value, (shared, held, data), is_leaf=_is_primal)
+        both = jax.value_and_grad(loss, has_aux=True)
+        return mean_over_blocks(lambda block: both(shared, held, block), split(data))
+
+    def backward(grads, cotangents):
+        value, aux = cotangents
+        if not all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(aux, is_leaf=_is_zero)):
+            raise ValueError(f"{where}: only the total has a gradient in {count} blocks, its terms have none; ask one.")
+        value = jnp.zeros(value.shape, value.dtype) if _is_zero(value) else value
+        return jax.tree.map(lambda g: value * g, grads), None, None
+
+    def split(data):
+        size = len(jax.tree.leaves(data)[0])
+        if size % count:
+            raise ValueError(f"{where}: {size} rays have no {count} equal blocks; give another number of blocks.")
+        return jax.tree.map(lambda x: x.reshape(count, -1, *x.shape[1:]), data)
+
+    mean.defvjp(forward, backward, symbolic_zeros=True)
+    return mean
+
+
+def _is_primal(x):
+    return isinstance(x, CustomVJPPrimal)
+
+
+def _is_zero(x):
+    return isinstance(x, SymbolicZero)
+
+
+def mean_over_blocks(fn: Callable, blocks: Any) -> Any:
+    """Mean of a tree-valued function over the leading axis of `blocks`, summed inside the loop: one block in memory."""
+    count = jax.tree.leaves(blocks)[0].shape[0]
+    shapes = jax.eval_shape(fn, jax.tree.map(lambda x: x[0], blocks))
+    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    total, _ = jax.lax.scan(lambda carry, block: (jax.tree.map(jnp.add, carry, fn(block)), None), zeros, blocks)
+    return jax.tree.map(lambda x: x / count, total)
