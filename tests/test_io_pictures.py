@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from zestjax.io import figures, pictures, video
+from zestjax.io.claims import claimed_size, most_pixels
 
 
 @pytest.fixture
@@ -141,3 +142,13 @@ def test_a_film_that_was_cut_short_by_a_full_disk_is_not_kept(tmp_path, monkeypa
     encode = video._encode_webm
     monkeypatch.setattr(video, "_encode_webm", lambda path, bgr, fps: encode(path, bgr[:-1], fps))
     assert video.write_video(tmp_path / "film", moving_bar(32, 48, 3)).suffix == ".webp"
+
+
+def test_a_png_whose_chunk_claims_more_than_the_file_has_is_refused_before_memory_is_taken(tmp_path):
+    whole = cv2.imencode(".png", np.full((8, 9, 3), 7, np.uint8))[1].tobytes()
+    data = whole.index(b"IDAT") - 4
+    for content in (whole[:data] + (2**31 - 1).to_bytes(4) + whole[data + 4 :], whole[:-12], whole[:-1]):
+        assert claimed_size(content) is None
+    assert claimed_size(whole) == (8, 9)
+    flat = whole[:16] + (9000).to_bytes(4) + (9000).to_bytes(4) + whole[24:]
+    assert most_pixels(flat) < 9000 * 9000  # no stream of so few bytes holds so many

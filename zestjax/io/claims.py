@@ -32,7 +32,16 @@ def most_pixels(content):
 
 
 def _png(content):
-    return struct.unpack_from(">II", content, 16)[::-1]
+    """None where a chunk claims more bytes than the file has: decoders take memory for it first."""
+    at, size = len(PNG), struct.unpack_from(">II", content, 16)[::-1]
+    while at < len(content):
+        length, kind = struct.unpack_from(">I4s", content, at)
+        at += length + 12  # length, kind and checksum
+        if at > len(content):
+            return None
+        if kind == b"IEND":
+            return size
+    return None
 
 
 def _jpeg(content):
