@@ -101,7 +101,7 @@ def child(command, out, root, number):
     else:
         finetune.CHECKPOINT_SECONDS = CHECKPOINT_SECONDS
         finetune.finetune(finetune.FinetuneOptions(
-            str(root / "scene"), out, root / "train/weights.safetensors", budget=1e6, steps=STEPS["finetune"],
+            str(root / "scene"), out, root / "start/weights.safetensors", budget=1e6, steps=STEPS["finetune"],
             resume=True, quiet=True,
         ))  # fmt: skip
     print(killer.count)
@@ -161,6 +161,12 @@ def study(options):
     root, draw = options.out, random.Random(options.seed)
     shutil.rmtree(root, ignore_errors=True)
     simulate(SimulateOptions(root / "scene", scene="walker", size=(32, 48), frames=6, quiet=True))
+    # Fine-tuning starts from a system that does not ask its frames what moves: after a few steps' training all of them
+    # seems to, and there would be nothing to learn from.
+    train.train(train.TrainOptions(
+        root / "start", preset="tiny", system="zest-none", steps=4, clips=root / "clips", clip_count=2,
+        steps_per_clip=3, quiet=True,
+    ))  # fmt: skip
     rows, wrong, measures = Counter(), [], {}
     for command in STEPS:
         run(command, root / command, root)  # compiles

@@ -28,6 +28,7 @@ from zestjax.train.training import TrainState
 RATE = Cosine(1e-3, 1e-3, 5)
 STILL_WEIGHTS = dict(static_rec=20.0)
 MOVING = 0.3  # probability of moving from which a pixel is left out, and its surroundings with it
+LEAST_STILL = 0.01  # share of the pixels that must stand still: with less a run would learn from nothing, at loss 0
 FOREVER = 1_000_000
 CHECKPOINT_SECONDS = 60.0  # the default budget: a run that asks for more loses at most this much to a kill
 
@@ -88,11 +89,20 @@ def finetune(options):
 
 
 def moving_pixels(model, video, exclude):
-    """(N, H, W) bool of what may move, by the frames' own analysis; None where the model has none."""
+    """(N, H, W) bool of what may move, by the frames' own analysis; None where the model has none.
+
+    Raises:
+      ValueError: hardly anything stands still.
+    """
     maps = novel_view.prepare(model.params, video, system=model.system, exclude=exclude).maps
     if maps is None:
         return None
     size = video.images.shape[2:0:-1]
     likely = np.asarray(jax.nn.sigmoid(maps.moving_logits), np.float32)
-    grown = [cv2.resize(cv2.dilate(frame, np.ones((3, 3))), size) for frame in likely]
-    return np.stack(grown) > MOVING
+    moving = np.stack([cv2.resize(cv2.dilate(frame, np.ones((3, 3))), size) for frame in likely]) > MOVING
+    if (still := 1 - moving.mean()) < LEAST_STILL:
+        raise ValueError(
+            f"finetune: the weights take all but {still:.1%} of the pixels for moving, which leaves nothing to learn "
+            "from; give weights that were trained for longer, or another scene."
+        )
+    return moving
