@@ -175,6 +175,8 @@ def study(options):
         _, events = run(command, root / "again", root)
         measures[command] = (events, time.perf_counter() - start)
         wrong += [f"{command}, not killed: {what}" for what in differences(command, root / "again", root / command)]
+    start, end = (load_weights(root / name / "weights.safetensors")[0] for name in ("start", "finetune"))
+    wrong += ["fine-tuning learned nothing"] * all(np.array_equal(start[name], end[name]) for name in start)
     number = 0
     while sum(rows.values()) < options.kills:
         command, number = tuple(STEPS)[number % 2], number + 1
