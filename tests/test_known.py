@@ -17,7 +17,7 @@ from zestjax.frames.known import answers_of, known_frames, shared
 from zestjax.io.scenes import load_scene
 from zestjax.losses.objective import PAPER_WEIGHTS
 from zestjax.systems import presets
-from zestjax.systems.system import reads_frames
+from zestjax.systems.fields import reads_frames
 from zestjax.train.measures import Truth, make_measures
 from zestjax.train.recipes import PAPER as PAPER_RECIPE
 from zestjax.train.recipes import PRIOR_STEPS, RECIPES, Pixels
@@ -228,7 +228,9 @@ def test_a_scene_is_learned_by_heart_in_one_frustum_from_all_its_frames():
     recipe = dataclasses.replace(
         stage.recipe_of(PAPER), system=presets.nsff(width=8, depth=2, levels=(2, 1), samples=4)
     )
-    assert not reads_frames(recipe.system) and reads_frames(PAPER) and reads_frames(presets.GEOMETRY)
+    read = lambda system: [reads_frames(field) for field in (system.static, system.dynamic)]
+    assert read(recipe.system) == [False, False] and read(PAPER) == [True, True]
+    assert read(presets.GEOMETRY) == [True, False] and read(presets.STILL) == [True, False]
     batch_at, seen = own_frame_batches(known(**FULL), recipe, seed=0, exclude=(5,)), {}
     for step in range(24):
         batch = batch_at(step)

@@ -207,3 +207,12 @@ def test_adam_takes_numbers_of_pythons_and_names_what_has_no_gradient():
     assert params["a"] == pytest.approx(0.9, abs=1e-6) and params["a"].dtype == jnp.float32
     with pytest.raises(TypeError, match=r"leaf `\['n'\]` is int32"):
         solver.init_state({"n": 3})
+
+
+def test_what_an_objective_closes_over_may_be_mapped():
+    def fitted(place):
+        away = lambda p, batch, _: (jnp.sum((p["x"] - place) ** 2) * batch, {})
+        return solve.fit_lbfgs(away, {"x": jnp.zeros(3)}, jnp.float32(2), {}).params["x"]
+
+    places = jnp.arange(1.0, 3.0)
+    np.testing.assert_allclose(jax.vmap(fitted)(places), jnp.stack([fitted(p) for p in places]), rtol=1e-5)

@@ -270,19 +270,19 @@ def _run(kind, options, objective, params, batch, weights):
     gradient = jax.value_and_grad(lambda x, data: objective(unravel(x), data, weights), has_aux=True)
     shared = dict(value_and_grad=True, implicit_diff=False, **options)
     plain = lambda x, data: (lambda out: (out[0][0], out[1]))(gradient(x, data))  # jaxopt mixes up terms of its own
-    if traced((params, batch, weights)):
+    closed_over = jax.make_jaxpr(gradient)(flat, batch).consts
+    if traced((params, batch, weights, closed_over)):
         flat, state = kind(fun=plain, jit=True, unroll=False, **shared).run(flat, batch)
     else:
-        gradient = _compiled(gradient, flat, batch)
+        gradient = _uninterrupted(jax.jit(gradient).lower(flat, batch).compile())
         with jax.disable_jit():  # of the loops and branches that jaxopt puts around it
             flat, state = kind(fun=plain, jit=False, unroll=True, **shared).run(flat, batch)
     (total, terms), grads = gradient(flat, batch)
     return Fit(unravel(flat), total, terms, tree_norm(grads), state.iter_num, state.error <= options["tol"])
 
 
-def _compiled(fn, *args):
-    """The function compiled for arguments like these, also where `jit` is disabled."""
-    compiled = jax.jit(fn).lower(*args).compile()
+def _uninterrupted(compiled):
+    """A compiled function, also where `jit` is disabled."""
 
     def call(*args):
         with jax.disable_jit(False):

@@ -11,7 +11,7 @@ from zestjax.apps.host import host_camera
 from zestjax.frames.assembly import footage, video_evidence
 from zestjax.frames.known import KnownFrames, known_frames
 from zestjax.io.scenes import Scene
-from zestjax.systems.system import reads_frames
+from zestjax.systems.fields import reads_frames
 from zestjax.train.batches import PreparedClip, batch_from_clip
 from zestjax.train.training import batch_key
 
@@ -50,16 +50,16 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
         holes = tuple(int(i) for i in np.roll(order, -place)[:size])
         evidence = None
         if maps is not None:
-            hidden = {*holes, *exclude}
             evidence = video_evidence(
-                seen, cameras, known.near, known.far, planes=maps.planes, exclude=tuple(hidden)
-            )  # fmt: skip
+                seen, cameras, known.near, known.far, planes=maps.planes, exclude=(*holes, *exclude)
+            )
         return PreparedClip(known, evidence, holes, tuple(exclude))
 
+    reading = any(map(reads_frames, (recipe.system.static, recipe.system.dynamic)))
     by_heart = PreparedClip(known, None, (), tuple(exclude), tuple(map(int, usable)))
 
     def batch_at(step):
-        chosen = prepared(step // STEPS_PER_HOLES) if reads_frames(recipe.system) else by_heart
+        chosen = prepared(step // STEPS_PER_HOLES) if reading else by_heart
         return batch_from_clip(batch_key(step, seed=seed), chosen, recipe, step=step)
 
     return batch_at

@@ -90,14 +90,14 @@ class Field(Protocol):
 
 
 @part
-class Static:
-    """The field of what stands still.
+class Choices:
+    """What both fields choose.
 
     frames: that serve it. volume: what it sweeps of them; None: it reads nothing and stands alone. head: of colour.
     width, depth: of the trunk. point_levels, view_levels: octaves of the encodings. modulation: see `trunk`.
     """
 
-    frames: KeyFrames = KeyFrames()
+    frames: Any = None
     volume: Swept | None = Swept()
     head: Head = Blend()
     width: int = 48
@@ -108,6 +108,13 @@ class Static:
 
     def __post_init__(self):
         check_field(self)
+
+
+@part
+class Static(Choices):
+    """The field of what stands still; see `Choices`."""
+
+    frames: KeyFrames = KeyFrames()
 
     def init(self, key: jax.Array) -> FieldParams:
         """Parameters."""
@@ -139,21 +146,11 @@ class Static:
 
 
 @part
-class Dynamic:
-    """The field of what moves; choices as of `Static`. reach: bound of the flow, frustum units."""
+class Dynamic(Choices):
+    """The field of what moves; see `Choices`. reach: bound of the flow, frustum units."""
 
     frames: Slots = Slots()
-    volume: Swept | None = Swept()
-    head: Head = Blend()
-    width: int = 48
-    depth: int = 3
-    point_levels: int = 2
-    view_levels: int = 1
-    modulation: str = "multiply"
     reach: float = 0.15
-
-    def __post_init__(self):
-        check_field(self)
 
     def init(self, key: jax.Array) -> FieldParams:
         """Parameters."""
@@ -185,14 +182,12 @@ class Dynamic:
             views = dynamic_views(samples, seen.views.times)
         elif seen.views is not None:
             samples = sample_views(seen.views, place.world(coords)[None])
-        reading, options = self.head(net.head, volume, samples, views), dict(modulation=self.modulation)
-        found = dynamic_field(
-            net, point, directions_of(self, marched), reading, reach=self.reach, early=early, **options
-        )
-        return gridded(found, marched)
+        reading, direction = self.head(net.head, volume, samples, views), directions_of(self, marched)
+        options: Any = dict(reach=self.reach, early=early, modulation=self.modulation)
+        return gridded(dynamic_field(net, point, direction, reading, **options), marched)
 
 
-def check_field(field: Static | Dynamic) -> None:
+def check_field(field: Choices) -> None:
     """Refuse sizes that no field has, and a head that looks at views where there are none."""
     name = type(field).__name__
     check_counts(
@@ -207,7 +202,12 @@ def check_field(field: Static | Dynamic) -> None:
         raise ValueError(f"{name}: the head looks at views, of which there are none without a volume; use `Direct`.")
 
 
-def sizes_of(field: Static | Dynamic, *, axes: int, features: int, summaries: int) -> dict[str, Any]:
+def reads_frames(field: Field | None) -> bool:
+    """Whether a field reads what frames show, as any does that is not ours and alone."""
+    return field is not None and not (isinstance(field, Choices) and field.volume is None)
+
+
+def sizes_of(field: Choices, *, axes: int, features: int, summaries: int) -> dict[str, Any]:
     """Arguments that the inits of both fields share. axes: of a point. features, summaries: of its views."""
     directions = 3 * (1 + 2 * field.view_levels)
     channels = 0 if field.volume is None else field.volume.channels
@@ -221,7 +221,7 @@ def sizes_of(field: Static | Dynamic, *, axes: int, features: int, summaries: in
     )
 
 
-def encoded(field: Static | Dynamic, params, inputs, maps, frustum, depths, *, slots: bool) -> Seen:
+def encoded(field: Choices, params, inputs, maps, frustum, depths, *, slots: bool) -> Seen:
     """What a field with a `Swept` volume reads of a target."""
     if field.volume is None:
         return Seen(None, None)

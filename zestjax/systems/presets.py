@@ -10,7 +10,7 @@ from typing import Any
 from zestjax.fields.heads import Blend, Direct
 from zestjax.frames.analysis import OwnMaps
 from zestjax.frames.selection import KeyFrames, Slots
-from zestjax.systems.fields import Dynamic, Static
+from zestjax.systems.fields import Dynamic, Static, reads_frames
 from zestjax.systems.mixes import Density, Opacity
 from zestjax.systems.sampling import Even, Guided
 from zestjax.systems.swept import OwnDepths, Pyramid, Swept
@@ -64,19 +64,18 @@ def without_volumes(system: System) -> System:
 
 def _guided_or_even(system, **changes):
     """The system with fields changed; where no volume is left, rays are sampled evenly and no frame is asked."""
-    static, dynamic = (changes.get(name, getattr(system, name)) for name in ("static", "dynamic"))
-    if static.volume is None and (dynamic is None or dynamic.volume is None):
+    if not any(reads_frames(changes.get(name, getattr(system, name))) for name in ("static", "dynamic")):
         changes |= dict(frames=None, sampler=Even(SAMPLES) if system.sampler.guided else system.sampler)
     return replace(system, **changes)
 
 
-def nsff(*, width: int, depth: int, levels: tuple[int, int], samples: int, spacing: str = "inverse") -> System:
+def nsff(*, width: int, depth: int, levels: tuple[int, int], samples: int) -> System:
     """Both fields without volumes in the first frame's frustum: a scene learned by heart (Li et al. 2021)."""
     shared: Any = dict(
         volume=None, head=Direct(), width=width, depth=depth, point_levels=levels[0], view_levels=levels[1]
     )
     return System(
-        Space(2, spacing, camera="key_frame", cells="strided"), Static(KeyFrames(1, "spread"), **shared),
+        Space(2, camera="key_frame", cells="strided"), Static(KeyFrames(1, "spread"), **shared),
         Dynamic(Slots((-2, -1, 1, 2)), reach=NSFF_REACH, **shared), Even(samples), frames=None,
     )  # fmt: skip
 

@@ -216,12 +216,6 @@ def swept(system: System) -> list[Swept]:
     return [volume for volume in volumes if isinstance(volume, Swept)]
 
 
-def reads_frames(system: System) -> bool:
-    """Whether the fields read what the frames show, as they do unless both stand alone."""
-    alone = lambda field: isinstance(field, Static | Dynamic) and field.volume is None
-    return not all(alone(field) for field in (system.static, system.dynamic) if field is not None)
-
-
 def split_maps(maps, count):
     """`FrameMaps` of V frames into those of the first `count` and the rest."""
     return jax.tree.map(lambda x: x[:count], maps), jax.tree.map(lambda x: x[count:], maps)
