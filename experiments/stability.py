@@ -1,6 +1,6 @@
 """2,000 training steps of `tiny` over random scenes, the nasty ones among them: nothing may cease to be finite.
 
-    python experiments/stability.py --out runs/stability [--steps 2000] [--losses paper] [--precision bfloat16]
+    python experiments/stability.py --out runs/stability [--steps 2000] [--losses paper] [--system svs]
 
 Each kind of scene is drawn several times; a step learns from one of them in turn. The exit code is 1 if a step was
 skipped, or a loss or a parameter is not finite. Writes `stability.json`: losses by kind of scene, and the seconds.
@@ -23,7 +23,8 @@ from zestjax.simulate.clips import clip
 from zestjax.simulate.random import random_scene
 from zestjax.train import batches
 from zestjax.train.learn import SIMULATED_WEIGHTS
-from zestjax.train.recipes import recipe_of
+from zestjax.train.recipes import SYSTEMS, recipe_of
+from zestjax.train.training import scalars
 
 GREY = np.uint32(0x80808080)
 LOSSES = {"simulated": SIMULATED_WEIGHTS, "paper": PAPER_WEIGHTS}
@@ -102,29 +103,39 @@ def prepared_clips(recipe, options):
 def trained(recipe, clips, options):
     """The last parameters, how many steps were skipped, the losses of each kind, and the seconds of a step."""
     init, step = recipe.trainer(steps=options.steps)
-    step, params = jax.jit(step, donate_argnums=(0, 1)), recipe.system.init(jax.random.key(options.seed))
+    step, params = jax.jit(step, donate_argnums=(0, 1)), recipe.init(jax.random.key(options.seed))
     state, losses, seconds = init(params), {name: [] for name in KINDS}, []
     for number in progress(range(options.steps), "steps", quiet=options.quiet):
         kind, prepared = clips[number % len(clips)]
         batch = batches.batch_from_clip(jax.random.key(number), prepared, recipe)
         start = time.perf_counter()
         params, state, terms = step(params, state, batch)
-        losses[kind].append({name: float(value) for name, value in terms.items()})
+        losses[kind].append(scalars(terms) | {"step": number})
         seconds.append(time.perf_counter() - start)
     return params, int(state.skipped), losses, float(np.median(seconds))
 
 
+def by_fifths(losses, steps):
+    """Each term's mean over every fifth of the run, over all scenes."""
+    rows = sorted((row for rows in losses.values() for row in rows), key=lambda row: row["step"])
+    fifths = [rows[steps * i // 5 : steps * (i + 1) // 5] for i in range(5)]
+    mean = lambda part, name: round(float(np.mean([row[name] for row in part])), 4)
+    return {name: [mean(part, name) for part in fifths if part] for name in rows[0] if name != "step"}
+
+
 def stability(options):
     """Run it; the report, whose `finite` says whether everything was."""
-    recipe = recipe_of("tiny", precision=options.precision).weighted(LOSSES[options.losses])
+    recipe = recipe_of("tiny", system=options.system, precision=options.precision)
+    recipe = recipe.weighted(LOSSES[options.losses]) if options.system == "zest" else recipe.of(recipe.system)
     params, skipped, losses, seconds = trained(recipe, prepared_clips(recipe, options), options)
     totals = {kind: np.array([row["total"] for row in rows]) for kind, rows in losses.items()}
     finite = all(np.isfinite(list(row.values())).all() for rows in losses.values() for row in rows)
     lost = first_nonfinite(params)
     report = {
-        "steps": options.steps, "losses": options.losses, "precision": options.precision, "skipped": skipped,
+        "steps": options.steps, "system": options.system, "losses": options.losses,
+        "precision": options.precision, "skipped": skipped,
         "finite": finite and lost is None and skipped == 0, "first_nonfinite_parameter": lost,
-        "seconds_per_step": seconds,
+        "seconds_per_step": seconds, "terms": by_fifths(losses, options.steps),
         "kinds": {k: {"steps": len(t), "first": float(t[: len(t) // 4].mean()), "last": float(t[-len(t) // 4 :].mean()),
                       "greatest": float(t.max())} for k, t in totals.items() if len(t)},
     }  # fmt: skip
@@ -136,6 +147,7 @@ def parsed(arguments=None):
     """The command's options."""
     parser = argparse.ArgumentParser(description="Training steps over nasty scenes; nothing may cease to be finite.")
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--system", choices=SYSTEMS, default="zest")
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--scenes", type=int, default=6, help="drawn of each kind")
     parser.add_argument("--losses", choices=tuple(LOSSES), default="simulated")

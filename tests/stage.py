@@ -29,7 +29,8 @@ from zestjax.systems.system import Space, System
 from zestjax.systems.targets import target_inputs
 from zestjax.train.batches import PreparedClip, batch_from_clip, prepare_clip
 from zestjax.train.learn import SIMULATED_WEIGHTS, train_step, training_objective
-from zestjax.train.recipes import Pixels, Recipe, Rows
+from zestjax.train.rays import Pixels, Rows
+from zestjax.train.recipes import Recipe
 from zestjax.train.terms import measurable
 from zestjax.video import Video
 

@@ -10,7 +10,7 @@ from zestjax.frames.assembly import footage, video_evidence
 from zestjax.frames.evidence import Evidence
 from zestjax.train import batches
 from zestjax.train.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
-from zestjax.train.recipes import Pixels, Rows
+from zestjax.train.rays import Pixels, Rows
 
 RECIPE = stage.recipe_of(MINI)
 

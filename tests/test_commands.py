@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from zestjax.apps.log import read_log
+from zestjax.apps.weights import open_weights
 from zestjax.io.nsff import read_nsff
 from zestjax.io.weights import load_weights
 from zestjax.losses.objective import PAPER_WEIGHTS
@@ -139,6 +140,27 @@ def test_the_papers_preset_learns_from_exactly_the_papers_terms(place):
     (line,) = read_log(place / "paper/log.jsonl")[0]
     assert line.keys() - {"step", "seconds", "seconds_per_step", "total"} == PAPER_WEIGHTS.keys()
     assert all(np.isfinite(line[name]) for name in PAPER_WEIGHTS)
+
+
+@pytest.mark.parametrize("system", ["svs", "mvsnerf"])
+def test_a_baseline_goes_through_the_same_commands(place, scene, system):
+    out, clips = place / system, ("--clips", place / "clips", "--clip-count", 2)
+    learn = ("train", "--preset", "tiny", "--system", system, *clips, "--out", out)
+    finish(place, *learn, "--steps", 4)
+    finish(place, *learn, "--steps", 8, "--resume")
+    weights = out / "weights.safetensors"
+    model = open_weights(weights, system=system)
+    assert model.name == system and (model.opponent is not None) == (system == "svs")
+    given, tuned = ("--scene", scene, "--weights", weights, "--system", system), place / f"{system}_tuned"
+    finish(place, "finetune", *given, "--budget", 2, "--out", tuned)
+    before, after = (load_weights(path)[0] for path in (weights, tuned / "weights.safetensors"))
+    assert before.keys() == after.keys() and any((before[name] != after[name]).any() for name in before)
+    finish(place, "evaluate", *given, "--targets", 2, "--out", place / f"{system}_scores")
+    report = json.loads((place / f"{system}_scores/metrics.json").read_text())
+    assert report["system"] == system and report["mean"]["full"]["psnr"] > 5
+    finish(place, "render", *given, "--frames", 2, "--out", place / f"{system}_path")
+    refused = start(place, "evaluate", *given[:4], "--system", "zest", "--out", place / "no")
+    assert f"holds weights of `{system}`, not `zest`" in refused.communicate()[1] and refused.returncode == 2
 
 
 def test_nsff_learns_a_scene_by_heart_through_the_same_commands(place, scene):

@@ -50,7 +50,7 @@ def test_odd_metadata_is_one_error_that_names_the_file(tmp_path, kind):
     path = tmp_path / "w.safetensors"
     path.write_bytes(signed(METADATA[kind]))
     with pytest.raises(WeightsError) as caught:
-        open_weights(path, published=True)
+        open_weights(path)
     assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
     assert "altered" not in str(caught.value)
 

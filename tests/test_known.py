@@ -19,8 +19,9 @@ from zestjax.losses.objective import PAPER_WEIGHTS
 from zestjax.systems import presets
 from zestjax.systems.fields import reads_frames
 from zestjax.train.measures import Truth, make_measures
+from zestjax.train.rays import Pixels
 from zestjax.train.recipes import PAPER as PAPER_RECIPE
-from zestjax.train.recipes import PRIOR_STEPS, RECIPES, Pixels
+from zestjax.train.recipes import PRIOR_STEPS, RECIPES
 from zestjax.train.terms import ANSWERS, check_answers, measurable, unmeasured
 
 H, W = stage.SIZE

@@ -174,13 +174,13 @@ def test_import_writes_what_evaluate_opens(tmp_path, made):
         assert (
             main(["import-mvsnerf", str(tmp_path / "mvsnerf.npz"), "--out", str(out), "--statistics", statistics]) == 0
         )
-        model = open_weights(out, published=True)
+        model = open_weights(out)
         field = model.params.static
         assert model.name == "mvsnerf" and model.system.static == MvsNerf(statistics=statistics)
         assert (field.features.blocks[0].norm.statistics is None) == (statistics == "batch")
         np.testing.assert_array_equal(field.field.trunk.layers[5].kernel, made.field.trunk.layers[5].kernel)
-        with pytest.raises(WeightsError, match="which only `render` and `evaluate` can use"):
-            open_weights(out)
+        with pytest.raises(WeightsError, match="holds weights of `mvsnerf`, not `zest`"):
+            open_weights(out, system="zest")
 
 
 def test_import_names_what_is_wrong(tmp_path, made, capsys):

@@ -29,7 +29,8 @@ from zestjax.systems.mvsnerf import MVSNERF, MvsNerf
 from zestjax.systems.sampling import Even
 from zestjax.systems.system import Space, System
 from zestjax.train.learn import training_objective
-from zestjax.train.recipes import PARTS, RECIPES, Cosine, Decaying, Fixed, Recipe, Rows, pairs
+from zestjax.train.rays import Rows
+from zestjax.train.recipes import PARTS, RECIPES, Cosine, Decaying, Fixed, Recipe, pairs
 
 through_json = lambda value: json.loads(json.dumps(to_stored(value)))
 NAMED = {name: value for name, value in vars(presets).items() if isinstance(value, System)} | {"MVSNERF": MVSNERF}

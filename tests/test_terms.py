@@ -43,7 +43,7 @@ SYSTEMS = {
 @pytest.mark.parametrize(
     "name, system, needs",
     [
-        ("distortion", MINI, "a measure of that name"),
+        ("edge", MINI, "a measure of that name"),
         ("rcc", PAPER, "a measure of that name"),
         ("depth_ce", PAPER, "volumes whose cells have logits"),
         ("depth_ce", REGULAR, "volumes whose cells have logits"),
@@ -66,8 +66,8 @@ def test_a_weight_whose_term_cannot_be_measured_is_refused_with_what_it_needs(na
 
 
 def test_all_that_are_lost_are_named_together():
-    with pytest.raises(ValueError, match="`adv`.*`distortion`.*`frame_ce`"):
-        check_weights("f", PAPER, dict(rec=1.0, adv=1.0, distortion=0.5, frame_ce=0.1))
+    with pytest.raises(ValueError, match="`adv`.*`edge`.*`frame_ce`"):
+        check_weights("f", PAPER, dict(rec=1.0, adv=1.0, edge=0.5, frame_ce=0.1))
 
 
 def test_a_step_that_learns_from_nothing_is_refused():

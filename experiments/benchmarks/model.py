@@ -1,6 +1,6 @@
 """Seconds, memory and share of the machine's matmul peak of a training step and of a rendered view; a JSON line each.
 
-    python experiments/benchmarks/model.py [--preset small] [--repeats 5] [--rows 8]
+    python experiments/benchmarks/model.py [--preset small] [--system zest] [--repeats 5] [--rows 8]
 
 The clip is noise seen by cameras on a line: arithmetic does not depend on what is seen. `--rows` renders only that many
 rows of a view (0: all of it). Compile seconds are apart; peak memory is the process's.
@@ -21,7 +21,7 @@ from zestjax.cameras import Camera
 from zestjax.simulate.clips import Clip
 from zestjax.systems.targets import target_inputs
 from zestjax.train import batches
-from zestjax.train.recipes import RECIPES
+from zestjax.train.recipes import RECIPES, SYSTEMS, recipe_of
 from zestjax.video import Video
 
 
@@ -80,7 +80,7 @@ def measure_step(recipe, clip, repeats):
     init, step = recipe.trainer(steps=1000)
     prepared = batches.prepare_clip(jax.random.key(0), clip, recipe.system)
     batch = batches.batch_from_clip(jax.random.key(1), prepared, recipe)
-    params = recipe.system.init(jax.random.key(2))
+    params = recipe.init(jax.random.key(2))
     state = [params, init(params)]
     start = time.perf_counter()
     compiled = jax.jit(step, donate_argnums=(0, 1)).lower(*state, batch).compile()
@@ -119,10 +119,12 @@ def main():
     """Measure and print."""
     parser = argparse.ArgumentParser(description="Times a training step and a rendered view.")
     parser.add_argument("--preset", default="small", choices=tuple(RECIPES))
+    parser.add_argument("--system", default="zest", choices=SYSTEMS)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--rows", type=int, default=0)
     options = parser.parse_args()
-    recipe, peak = RECIPES[options.preset], matmul_peak()
+    recipe, peak = recipe_of(options.preset, system=options.system), matmul_peak()
+    recipe = recipe.of(recipe.system)
     clip = noise_clip(recipe)
     stages = {
         "training step": lambda: measure_step(recipe, clip, options.repeats),
@@ -130,7 +132,7 @@ def main():
     }
     for name, stage in stages.items():
         reset_peak()
-        row = {"preset": options.preset, "what": name, **stage(), "peak_mb": peak_megabytes()}
+        row = {"preset": options.preset, "system": options.system, "what": name, **stage(), "peak_mb": peak_megabytes()}
         if row["flops"]:
             row["share_of_matmul_peak"] = row["flops"] / row["best"] / peak
         row |= {"matmul_gflops": peak / 1e9, "load": os.getloadavg()[0], "device": jax.devices()[0].device_kind}

@@ -25,7 +25,8 @@ from zestjax.systems.system import Space, System
 from zestjax.testing import assert_grads_match, explain_gradient, held
 from zestjax.train.batches import batch_from_clip, prepare_clip
 from zestjax.train.learn import training_objective
-from zestjax.train.recipes import Recipe, Rows
+from zestjax.train.rays import Rows
+from zestjax.train.recipes import Recipe
 
 small = dict(volume=Swept(widths=(4, 8)), width=16, depth=2)
 system = System(

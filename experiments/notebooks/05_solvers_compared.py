@@ -26,7 +26,8 @@ from zestjax.systems.swept import Swept
 from zestjax.systems.system import Space, System
 from zestjax.train.batches import batch_from_clip, prepare_clip
 from zestjax.train.learn import training_objective
-from zestjax.train.recipes import Recipe, Rows
+from zestjax.train.rays import Rows
+from zestjax.train.recipes import Recipe
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt is no longer developed, and says so

@@ -64,7 +64,7 @@ def _train(commands):
     command = _command(commands, "train", "scene-agnostic training", _run_train)
     command.add_argument("--preset", default="small", help="tiny, small or paper (default small)")
     command.add_argument(
-        "--system", default="zest", help="zest, zest-geometry, zest-motion, zest-none, or nsff (default zest)"
+        "--system", default="zest", help="zest, mvsnerf, svs, nsff, zest-geometry, zest-motion or zest-none"
     )
     command.add_argument("--stage", default="all", help="frames (what each says of itself), views (the rest) or all")
     command.add_argument(
@@ -110,7 +110,6 @@ def _render(commands):
 def _evaluate(commands):
     command = _command(commands, "evaluate", "scores against held-out truth, beside floors and ceiling", _run_evaluate)
     _scene_flags(command)
-    command.add_argument("--system", help="refuse weights of another system")
     command.add_argument("--protocol", default="held-out", help="held-out, strict or paper (default held-out)")
     command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: all)")
     command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
@@ -167,6 +166,7 @@ def _scene_flags(command):
     command.add_argument("--scene", required=True, metavar="PATH", help="a scene's folder, or bench:NAME")
     command.add_argument("--format", metavar="NAME", help="layout of the folder (default: recognised)")
     command.add_argument("--weights", type=Path, metavar="W", help="default: the shipped ones")
+    command.add_argument("--system", help="refuse weights of another system")
     command.add_argument("--size", type=_size, metavar="HxW", help="default: the preset's height")
 
 

@@ -13,7 +13,8 @@ from zestjax.systems.mixes import Density, Opacity
 from zestjax.systems.sampling import Even, Guided
 from zestjax.systems.swept import OwnDepths, Pyramid, Swept
 from zestjax.systems.system import Space, System
-from zestjax.train.recipes import Pixels, Recipe, Rows
+from zestjax.train.rays import Pixels, Rows
+from zestjax.train.recipes import Recipe
 
 RENAMED = {
     ".geometry.": ".static.volume.",

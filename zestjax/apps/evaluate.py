@@ -57,7 +57,7 @@ def evaluate(options):
     Raises:
       ValueError, WeightsError: a scene, a target or weights that cannot be used.
     """
-    model = open_weights(options.weights, system=options.system, published=True)
+    model = open_weights(options.weights, system=options.system)
     model = at_precision(model, options.precision)
     with arithmetic(options.precision):
         return _evaluate(model, options)

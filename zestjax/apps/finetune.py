@@ -40,6 +40,7 @@ class FinetuneOptions:
     scene: str
     out: Path
     weights: Path | None = None
+    system: str | None = None
     budget: float = 60.0
     exclude: tuple = ()
     size: tuple | None = None
@@ -60,7 +61,9 @@ def finetune(options):
     Raises:
       ValueError, WeightsError: a scene or weights that cannot be used, or no frame left to learn from.
     """
-    model = open_weights(options.weights)
+    model = open_weights(options.weights, system=options.system)
+    if getattr(model.system.static, "statistics", "batch") != "batch":
+        raise ValueError("finetune: norms with stored statistics do not learn; import them with --statistics batch.")
     opened = open_scene(
         options.scene, model.recipe, size=options.size, protocol=None, layout=options.format, exclude=options.exclude
     )
@@ -73,7 +76,7 @@ def finetune(options):
     recipe = recipe.of(model.system, known=answers_of(known)) if moving is None else recipe.weighted(STILL_WEIGHTS)
     (init, step_fn), objective = recipe.trainer(steps=FOREVER), recipe.objective()
     explain = functools.partial(find_fault, objective)
-    params = jax.tree.map(jnp.array, model.params)  # copies: the step donates
+    params = jax.tree.map(jnp.array, model.trained)  # copies: the step donates
     loop = LoopOptions(
         options.out, options.steps, options.budget, options.resume, CHECKPOINT_SECONDS, quiet=options.quiet
     )

@@ -44,6 +44,7 @@ class FrontierOptions:
     scene: str
     out: Path
     weights: Path | None = None
+    system: str | None = None
     size: tuple | None = None
     targets: tuple | None = None
     format: str | None = None
@@ -58,7 +59,8 @@ def settings_of(system):
     looking = lambda n: replace(system, static=replace(system.static, frames=replace(frames, count=n)))
     evenly = lambda n: replace(system, sampler=Even(n, "plane"))
     tried = [Setting("as trained", system)]
-    if system.static.head.looks:  # a head that looks at each view takes any number of them
+    head = getattr(system.static, "head", None)
+    if head is not None and head.looks:  # a head that looks at each view takes any number of them
         views = frames.count
         tried += [Setting(f"{n} views", looking(n)) for n in (views * 3 // 2, views // 2, views // 4)]
     tried += [Setting(f"{n} planes", swept(n)) for n in (planes * 3 // 2, planes // 2)]
@@ -81,7 +83,7 @@ def frontier(options):
     Raises:
       ValueError, WeightsError: a scene or weights that cannot be used.
     """
-    model, out = open_weights(options.weights), Path(options.out)
+    model, out = open_weights(options.weights, system=options.system), Path(options.out)
     opened = open_scene(options.scene, model.recipe, size=options.size, protocol="held-out", layout=options.format,
                         targets=options.targets or default_times(options))  # fmt: skip
     scene, rows = opened.scene, []

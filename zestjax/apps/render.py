@@ -31,6 +31,7 @@ class RenderOptions:
     scene: str
     out: Path
     weights: Path | None = None
+    system: str | None = None
     path: str = "orbit"
     frames: int | None = None
     size: tuple | None = None
@@ -57,7 +58,7 @@ def render(options):
 
 
 def _render(options):
-    model = at_precision(open_weights(options.weights, published=True), options.precision)
+    model = at_precision(open_weights(options.weights, system=options.system), options.precision)
     out = Path(options.out)
     scene = open_scene(options.scene, model.recipe, size=options.size, protocol=None, layout=options.format).scene
     model = standing_still(model) if options.still else model

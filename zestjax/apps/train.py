@@ -120,10 +120,10 @@ def run_recipe(recipe, options, *, known=None):
     if options.stage != "all" and recipe.system.frames is None:
         raise ValueError(f"train: --stage {options.stage} needs a system whose frames are analysed; drop --stage.")
     wanted = stage_weights(options.stage, weights=dict(recipe.weights.terms))
-    if (lost := unmeasured(recipe.system, wanted, known=known)) and not options.quiet:
+    if (lost := unmeasured(recipe.system, wanted, own=recipe.terms, known=known)) and not options.quiet:
         listed = "; ".join(f"{name} (needs {need})" for name, need in lost.items())
         print(f"train: this run learns without {listed}", file=sys.stderr)
-    recipe = recipe.weighted(measurable(recipe.system, wanted, known=known))
+    recipe = recipe.weighted(measurable(recipe.system, wanted, own=recipe.terms, known=known))
     if options.peak is None:
         return recipe
     rate = recipe.rate
@@ -133,10 +133,12 @@ def run_recipe(recipe, options, *, known=None):
 def fresh(recipe, options):
     """A run's first `TrainState`, from the seed or from given weights, and its compiled step."""
     with jax.threefry_partitionable(False):  # the other form of the same generator compiles ten times longer here
-        params: Any = recipe.system.init(jax.random.key(options.seed))
+        params: Any = recipe.init(jax.random.key(options.seed))
     if options.weights is not None:
         params = load_params(options.weights, like=params)
     if options.analysis is not None:
+        if recipe.system.frames is None:
+            raise ValueError(f"train: --analysis is of maps that `{options.system}` does not ask for; drop it.")
         other: Any = load_params(options.analysis, like=params)
         params = params._replace(analysis=other.analysis)
     init, step_fn = recipe.trainer(steps=options.steps)

@@ -13,24 +13,27 @@ from zestjax.base.checks import check_option
 from zestjax.base.parts import from_stored, to_stored
 from zestjax.io.mvsnerf import read_mvsnerf
 from zestjax.io.weights import WeightsError, load_weights, read_metadata, save_weights
+from zestjax.losses.adversarial import DiscriminatorParams
 from zestjax.systems import presets
-from zestjax.systems.mvsnerf import MVSNERF, STATISTICS, Ends, MvsNerf
+from zestjax.systems.mvsnerf import MVSNERF, STATISTICS, MvsNerf
 from zestjax.systems.system import Params, System
+from zestjax.train.adversary import Opponents
 from zestjax.train.recipes import PARTS, Fixed, Recipe, pairs
 
 PUBLISHED = "mvsnerf"
-KNOWN = (*PARTS, MvsNerf, Ends)  # the parts that a file of weights may name
 
 
 class Model(NamedTuple):
     """params: learned arrays. recipe: `Recipe` of the run; of it, system: what `params` belong to. name: the system's,
-    for people. path: the file. metadata: dict of the run."""
+    for people. path: the file. metadata: dict of the run. opponent: the discriminator that they were trained against,
+    or None."""
 
     params: Params
     recipe: Recipe
     name: str
     path: Path
     metadata: dict
+    opponent: DiscriminatorParams | None = None
 
     @property
     def system(self) -> System:
@@ -41,6 +44,11 @@ class Model(NamedTuple):
     def preset(self) -> str:
         """Name of the preset that the run started from."""
         return str(self.metadata.get("preset", self.name))
+
+    @property
+    def trained(self) -> Params | Opponents:
+        """All that the run trained, as of `Recipe.init`."""
+        return self.params if self.opponent is None else Opponents(self.params, self.opponent)
 
     def running(self, system: System, params: Params | None = None) -> "Model":
         """The same weights, or some of them, run as another system."""
@@ -53,7 +61,7 @@ def shipped_weights():
     return Path(str(resources.files("zestjax") / "weights" / "small.safetensors"))
 
 
-def recipe_from_metadata(metadata, known=KNOWN):
+def recipe_from_metadata(metadata, known=PARTS):
     """The `Recipe` of a file's metadata, of this version or of 0.1.
 
     Args:
@@ -94,13 +102,12 @@ def arithmetic(precision=None):
 
 
 @arithmetic()
-def open_weights(path=None, *, system=None, published=False, parts=()):
+def open_weights(path=None, *, system=None, parts=()):
     """Load weights and their recipe.
 
     Args:
       path: file; None: the shipped ones.
       system: refuse weights of another system.
-      published: MVSNeRF's weights, as `import-mvsnerf` writes them, will do as well.
       parts: classes of your own that its system is made of.
 
     Returns:
@@ -112,20 +119,19 @@ def open_weights(path=None, *, system=None, published=False, parts=()):
     path = Path(path) if path is not None else shipped_weights()
     metadata = read_metadata(path)
     name = metadata.get("system")
-    if name == PUBLISHED and not (published and system in (None, PUBLISHED)):
-        raise WeightsError(f"{path}: holds MVSNeRF's weights, which only `render` and `evaluate` can use.")
-    if name == PUBLISHED and metadata.get("statistics") not in STATISTICS:
+    if name == PUBLISHED and "recipe" not in metadata and metadata.get("statistics") not in STATISTICS:
         raise WeightsError(f"{path}: does not say whose statistics its norms have; import the published file again.")
     try:
-        recipe = recipe_from_metadata(metadata, (*KNOWN, *parts))
+        recipe = recipe_from_metadata(metadata, (*PARTS, *parts))
         name = name if isinstance(name, str) else ablated_name(recipe.system)
-        like = jax.eval_shape(recipe.system.init, jax.random.key(0))
+        like = jax.eval_shape(recipe.init, jax.random.key(0))
     except (KeyError, TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
         raise WeightsError(f"{path}: {error}; use its version.") from error
     if system is not None and system != name:
         raise WeightsError(f"{path}: holds weights of `{name}`, not `{system}`; train them with --system {system}.")
     params: Any = load_weights(path, like=like, renamed=None if "recipe" in metadata else names_of(name))[0]
-    return Model(params, recipe, name, path, metadata)
+    model, opponent = params if isinstance(params, Opponents) else (params, None)
+    return Model(model, recipe, name, path, metadata, opponent)
 
 
 def ablated_name(system):
@@ -141,11 +147,14 @@ def ablated_name(system):
 
 
 def load_params(path, *, like):
-    """Parameters of a file, like those given; of this version or of 0.1.
+    """Parameters of a file, like those given; of this version or of 0.1. Of opponents, a file of a renderer alone gives
+    the renderer.
 
     Raises:
       WeightsError: see `io.weights.load_weights`.
     """
+    if isinstance(like, Opponents) and not any(".discriminator" in name for name in load_weights(path)[0]):
+        return like._replace(model=load_params(path, like=like.model))
     earlier = "recipe" not in (metadata := read_metadata(path))
     return load_weights(path, like=like, renamed=names_of(metadata.get("system")) if earlier else None)[0]
 

@@ -27,7 +27,7 @@ from zestjax.nets.layers import Dense, Norm, Statistics, dense, init_dense
 from zestjax.nets.positional import positional_encoding
 from zestjax.planesweep import homographies, plane_depths
 from zestjax.resample import bilinear, trilinear
-from zestjax.systems.fields import Seen, flat, gridded
+from zestjax.systems.fields import MOST_LAYERS, MOST_WIDTH, Seen, flat, gridded
 from zestjax.systems.system import Space, System
 
 LEVELS = 10  # octaves of a point's encoding, as published
@@ -169,19 +169,22 @@ def field(params, coords, features, direction):
 class MvsNerf:
     """MVSNeRF's field, of a scene that stands still. frames: its sources, all of which must be there. padding: see the
     header. statistics: of the norms, of the images at hand (`batch`), as the published system always runs, or the
-    `stored` ones, which it never used."""
+    `stored` ones, which it never used. width, depth: of the trunk."""
 
     frames: KeyFrames = KeyFrames(3, least=3)
     padding: int = 24
     statistics: str = "batch"
+    width: int = 128
+    depth: int = 6
 
     def __post_init__(self):
         check_counts("MvsNerf", padding=(self.padding, 0, MOST_PADDING))
+        check_counts("MvsNerf", width=(self.width, 1, MOST_WIDTH), depth=(self.depth, 1, MOST_LAYERS))
         check_option("MvsNerf", statistics=(self.statistics, STATISTICS))
 
     def init(self, key: jax.Array) -> MvsNerfParams:
         """Parameters."""
-        params = init_mvsnerf(key, views=self.frames.count)
+        params = init_mvsnerf(key, views=self.frames.count, width=self.width, depth=self.depth)
         if self.statistics == "batch":
             return params
         known = lambda x: x._replace(statistics=Statistics(0 * x.offset, x.scale)) if isinstance(x, Norm) else x
@@ -206,7 +209,8 @@ class MvsNerf:
 
 @part
 class Ends:
-    """`samples` even ones, the first at near and the last at far; a density is per sample, whatever its interval.
+    """`samples` even ones, the first at near and the last at far, or anywhere up to half-way to their neighbours; a
+    density is per sample, whatever its interval.
 
     Reference: MVSNeRF renderer.py `raw2alpha`: an interval's length is not part of its opacity.
     """
@@ -224,9 +228,13 @@ class Ends:
         return None
 
     def fractions(self, guides, pixels, jitter):
-        """See `systems.sampling.Sampler`; jitter is not for it."""
+        """See `systems.sampling.Sampler`."""
         even = jnp.linspace(0, 1, self.samples, dtype=pixels.dtype)
-        return jnp.broadcast_to(even, (pixels.shape[0], self.samples))
+        if jitter is None:
+            return jnp.broadcast_to(even, (pixels.shape[0], self.samples))
+        half = 0.5 / (self.samples - 1)
+        low, high = jnp.maximum(even - half, 0), jnp.minimum(even + half, 1)
+        return low + jitter * (high - low)
 
     def lengths(self, fractions, depths, inputs, norm, planes):
         """See `systems.sampling.Sampler`."""

@@ -24,14 +24,23 @@ ZEST = System(Space(32), Static(), Dynamic(), Guided(), Opacity(), OwnMaps(32))
 _SMALL: dict[str, Any] = dict(width=16, depth=2, volume=Swept(widths=(4, 8)))
 TINY = System(Space(8), Static(KeyFrames(4), **_SMALL), Dynamic(**_SMALL), frames=OwnMaps(8, (8, 12)))
 
-_PAPER: dict[str, Any] = dict(
-    volume=Swept(Pyramid(32), (8, 16, 32, 64), occupied=False),
-    head=Direct(), width=256, depth=8, point_levels=10, view_levels=4,
-)  # fmt: skip
-PAPER = System(
-    Space(128, "depth", camera="key_frame", cells="strided"),
-    Static(KeyFrames(8, "spread"), **_PAPER), Dynamic(Slots((-2, -1, 1, 2)), reach=1.0, **_PAPER),
-    Even(128), frames=None,
+
+def published(
+    *, planes: int, features: int, widths: tuple[int, ...], samples: int, frames: KeyFrames, **field: Any
+) -> System:
+    """The published system at any size. planes: of the volumes. features, widths: of what is swept. samples: of a ray.
+    frames: of the static field. field: sizes of both fields, see `fields.Choices`."""
+    volume = Swept(Pyramid(features), widths, occupied=False)
+    field |= dict(volume=volume, head=Direct())
+    return System(
+        Space(planes, "depth", camera="key_frame", cells="strided"),
+        Static(frames, **field), Dynamic(Slots((-2, -1, 1, 2)), reach=1.0, **field), Even(samples), frames=None,
+    )  # fmt: skip
+
+
+PAPER = published(
+    planes=128, features=32, widths=(8, 16, 32, 64), samples=128, frames=KeyFrames(8, "spread"),
+    width=256, depth=8, point_levels=10, view_levels=4,
 )  # fmt: skip
 SVS = replace(PAPER, dynamic=None)
 

@@ -48,13 +48,44 @@ def in_blocks(loss: Callable, count: int, *, where: str = "in_blocks") -> Callab
         return jax.tree.map(lambda g: value * g, grads), None, None
 
     def split(data):
-        size = len(jax.tree.leaves(data)[0])
-        if size % count:
-            raise ValueError(f"{where}: {size} rays have no {count} equal blocks; give another number of blocks.")
-        return jax.tree.map(lambda x: x.reshape(count, -1, *x.shape[1:]), data)
+        return _split(data, count, where)
 
     mean.defvjp(forward, backward, symbolic_zeros=True)
     return mean
+
+
+def recomputed(fn: Callable, count: int, *, where: str = "recomputed") -> Callable:
+    """Make a function of a block of data one of all the data, computed in `count` blocks, and again for the gradient:
+    what lies between a block and its result is in memory for one block at a time.
+
+    Args:
+      fn: `fn(shared, block) -> tree`, pure; every leaf has the block's leading axis.
+      count: blocks. One block is the function itself.
+      where: name used in the message.
+
+    Returns:
+      `whole(shared, data) -> tree`, with a gradient in everything.
+
+    Raises:
+      ValueError: when called with data that has no so many equal blocks.
+    """
+    if count == 1:
+        return fn
+
+    def whole(shared, data):
+        again = jax.checkpoint(fn)
+        parts = jax.lax.map(lambda block: again(shared, block), _split(data, count, where))
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), parts)
+
+    return whole
+
+
+def _split(data, count, where):
+    """Data in equal blocks, along a new leading axis."""
+    size = len(jax.tree.leaves(data)[0])
+    if size % count:
+        raise ValueError(f"{where}: {size} rays have no {count} equal blocks; give another number of blocks.")
+    return jax.tree.map(lambda x: x.reshape(count, -1, *x.shape[1:]), data)
 
 
 def _is_primal(x):

@@ -17,7 +17,7 @@ from zestjax.base.precision import geometry_at, network_at
 from zestjax.frames.assembly import dequantised
 from zestjax.losses.objective import measured, present, weighted_sum
 from zestjax.systems.system import Params, System
-from zestjax.train.blocks import in_blocks
+from zestjax.train.blocks import in_blocks, recomputed
 from zestjax.train.measures import make_measures
 from zestjax.train.terms import FRAMES, VOLUMES, check_answers, check_weights, frames_only, scene_terms, weights_of
 
@@ -25,6 +25,7 @@ SIMULATED_WEIGHTS = dict(
     rec=20.0, static_rec=8.0, dynamic_rec=4.0, b=1e-3, depth_ce=0.1, mask=0.05, flow3d=0.2, frame_ce=0.1, frame_mask=0.1
 )  # the shipped weights' terms, with the simulator's exact answers
 STAGES = ("all", "frames", "views")
+SHOWN = "shown"  # beside the terms: colours of rays that are seen as a whole
 
 
 def stage_weights(stage: str, *, weights: Mapping[str, Any]) -> dict[str, Any]:
@@ -40,7 +41,12 @@ def stage_weights(stage: str, *, weights: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def training_objective(
-    system: System, *, weights: Mapping[str, Any], blocks: int = 1, own: Mapping[str, Callable] = {}
+    system: System,
+    *,
+    weights: Mapping[str, Any],
+    blocks: int = 1,
+    own: Mapping[str, Callable] = {},
+    whole: bool = False,
 ) -> Callable:
     """What a system is taught by, as one function: for `jax.grad`, our Adam, and every solver of jaxopt.
 
@@ -50,6 +56,8 @@ def training_objective(
       blocks: of rays. The objective is the mean of each block's own, and memory is one block's; with more than one its
         total alone has a gradient. In reverse mode, whatever the blocks: the convolutions know no other.
       own: measures of yours, by term: `measure(prediction, truth) -> ()` of a block of rays.
+      whole: measures see all rays at once, as a term of a patch must. What a block computed is then computed again for
+        its gradient; terms hold the rays' colours (R, 3) as SHOWN.
 
     Returns:
       `objective(params, batch, weights) -> (total, terms)`: weights are other numbers or arrays for the same terms, by
@@ -60,7 +68,8 @@ def training_objective(
     """
     declared = present(weights)
     check_weights("training_objective", system, declared, own=own)
-    rays = in_blocks(_ray_loss(system, own), blocks, where="training_objective")
+    of_block = _ray_loss(system, own, blocks if whole else 1, shows=whole)
+    rays = of_block if whole else in_blocks(of_block, blocks, where="training_objective")
 
     def objective(params: Params, batch, weights=declared):
         weights = {name: weights[name] for name in declared}
@@ -89,17 +98,25 @@ def _array(weight, batch):
     return jnp.asarray(weight, batch.truth.colour.dtype)
 
 
-def _ray_loss(system, own):
-    """`loss((params, volumes, weights), (inputs, scene without volumes), truth) -> (total, terms)` of a block."""
+def _ray_loss(system, own, blocks, *, shows):
+    """`loss((params, volumes, weights), (inputs, scene without volumes), truth) -> (total, terms)` of a block, itself
+    rendered in blocks."""
+
+    def render(shared, rays):
+        (params, scene, inputs), (pixels, jitter) = shared, rays
+        return system.render(params, scene, inputs, pixels, jitter=jitter)
+
+    rendered = recomputed(render, blocks, where="training_objective")
 
     def loss(shared, held, truth):
         (params, volumes, weights), (inputs, scene) = shared, held
         params, scene = network_at(system.precision, params), _with_volumes(scene, volumes)
-        prediction = system.render(params, scene, inputs, truth.pixels, jitter=truth.jitter)
+        prediction = rendered((params, scene, inputs), (truth.pixels, truth.jitter))
         check_answers("training_objective", {k: w for k, w in weights.items() if k not in own}, truth)
         measures = make_measures(system, params, scene, inputs) | own
         terms = measured(measures, prediction, truth, weights)
-        return weighted_sum(terms, weights), terms
+        shown = {SHOWN: prediction.colour} if shows else {}
+        return weighted_sum(terms, weights), terms | shown
 
     return loss
 

@@ -18,7 +18,7 @@ from zestjax.flow import optical_flow, world_flow
 from zestjax.losses.means import mean_over_valid
 from zestjax.losses.photometric import photometric_loss, reconstruction_loss
 from zestjax.losses.priors import depth_loss, geometric_loss
-from zestjax.losses.regularisers import blend_entropy_loss, disocclusion_loss
+from zestjax.losses.regularisers import blend_entropy_loss, disocclusion_loss, distortion_loss
 from zestjax.losses.scene_flow import cycle_loss, minimum_flow_loss, spatial_smoothness_loss, temporal_loss
 from zestjax.losses.supervision import motion_mask_loss
 from zestjax.rendering import composite, confidence_map, weights_from_density
@@ -176,6 +176,7 @@ def _sp(a, p, t):
 STATIC = {
     "rec": lambda a, p, t: reconstruction_loss(p.colour, t.colour),
     "static_rec": lambda a, p, t: reconstruction_loss(p.static_colour, t.static, valid=t.static_valid),
+    "distortion": lambda a, p, t: distortion_loss(p.weights, _edges(a, p)),
 }
 DYNAMIC = {
     "dynamic_rec": lambda a, p, t: reconstruction_loss(p.colour, t.colour, valid=t.moving),
@@ -221,6 +222,15 @@ def make_measures(
         return call
 
     return {name: bound(measure) for name, measure in RAYS.items()}
+
+
+def _edges(a, p):
+    """(R, S + 1) ends of the samples' intervals: half-way between them, and near and far, as shares of what lies
+    between those."""
+    near, far = a.inputs.near, a.inputs.far
+    inside = jax.lax.stop_gradient((p.marched.depths[:, 1:] + p.marched.depths[:, :-1]) / 2)
+    ends = jnp.zeros_like(inside[:, :1])
+    return jnp.concatenate([ends, (inside - near) / (far - near), ends + 1], axis=-1)
 
 
 def _surface_flow(flows, prediction, truth):

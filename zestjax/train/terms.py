@@ -84,14 +84,14 @@ ANSWERS = {
 
 
 def unmeasured(
-    system: System, weights: Mapping[str, Any], *, own: Mapping[str, Any] = {}, known: Collection[str] | None = None
+    system: System, weights: Mapping[str, Any], *, own: Collection[str] = (), known: Collection[str] | None = None
 ) -> dict[str, str]:
     """What of some weights a training step of a system cannot measure.
 
     Args:
       system: `System`.
       weights: by term.
-      own: measures of the user's, by term.
+      own: names of terms that are measured otherwise.
       known: answers of `ANSWERS` that the targets have; None: all of them, as simulated ones do.
 
     Returns:
@@ -107,14 +107,14 @@ def unmeasured(
     return lost
 
 
-def check_weights(where: str, system: System, weights: Mapping[str, Any], *, own: Mapping[str, Any] = {}) -> None:
+def check_weights(where: str, system: System, weights: Mapping[str, Any], *, own: Collection[str] = ()) -> None:
     """Refuse a weight of what a training step cannot measure: it would train without a word and without the term.
 
     Args:
       where: name of the calling function, used in the message.
       system: `System`.
       weights: by term.
-      own: measures of the user's, by term.
+      own: names of terms that are measured otherwise.
 
     Raises:
       ValueError: naming the terms, their weights and what they need; or there is no term at all.
@@ -129,10 +129,12 @@ def check_weights(where: str, system: System, weights: Mapping[str, Any], *, own
         )
 
 
-def measurable(system: System, weights: Mapping[str, Any], *, known: Collection[str] | None = None) -> dict[str, Any]:
+def measurable(
+    system: System, weights: Mapping[str, Any], *, own: Collection[str] = (), known: Collection[str] | None = None
+) -> dict[str, Any]:
     """Those of some weights whose terms a training step of this system can measure, on targets of which that is known;
     see `unmeasured`."""
-    lost = unmeasured(system, weights, known=known)
+    lost = unmeasured(system, weights, own=own, known=known)
     return {name: weight for name, weight in present(weights).items() if name not in lost}
 
 
