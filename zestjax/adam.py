@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from zestjax.base.numerics import safe_sqrt
 from zestjax.base.trees import all_finite, tree_cast, tree_norm
+from zestjax.base.types import Array, Scalar, Tree
 
 
 class AdamState(NamedTuple):
@@ -28,7 +30,7 @@ class AdamState(NamedTuple):
     aux: Any
 
 
-def moment_dtype(x):
+def moment_dtype(x: Array) -> DTypeLike:
     """float64 for float64 arrays, float32 for all others."""
     return jnp.float64 if x.dtype == jnp.float64 else jnp.float32
 
@@ -47,7 +49,7 @@ def _arrays(tree):
     return tree
 
 
-def init_adam(params, *, value_dtype=None, aux=None):
+def init_adam(params: Tree, *, value_dtype: DTypeLike | None = None, aux: Tree = None) -> AdamState:
     """The state before the first update.
 
     Args:
@@ -75,7 +77,20 @@ def init_adam(params, *, value_dtype=None, aux=None):
     )
 
 
-def adam(params, state, grads, value, *, rate, b1=0.9, b2=0.999, eps=1e-8, clip_norm=None, skip=True, aux=None):
+def adam(
+    params: Tree,
+    state: AdamState,
+    grads: Tree,
+    value: Array,
+    *,
+    rate: Scalar,
+    b1: Scalar = 0.9,
+    b2: Scalar = 0.999,
+    eps: Scalar = 1e-8,
+    clip_norm: Scalar | None = None,
+    skip: bool = True,
+    aux: Tree = None,
+) -> tuple[Tree, AdamState]:
     """One update.
 
     Source: Adam (Kingma and Ba 2015), algorithm 1.

@@ -5,6 +5,7 @@ its integer coordinate. `a_from_b` names a transform that takes coordinates in b
 products read `a_from_c = a_from_b @ b_from_c`. A pixel is (u, v): column, then row.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 
 from zestjax.base.checks import check_shapes
 from zestjax.base.numerics import matmul, matvec, safe_norm
+from zestjax.base.types import Array, Scalar
 
 NEAREST_DEPTH = 1e-6
 
@@ -24,8 +26,8 @@ class Camera(NamedTuple):
     camera_from_world: (..., 4, 4) rigid, world units.
     """
 
-    intrinsics: jax.Array
-    camera_from_world: jax.Array
+    intrinsics: Array
+    camera_from_world: Array
 
 
 class Projected(NamedTuple):
@@ -41,13 +43,13 @@ class Projected(NamedTuple):
     in_front: jax.Array
 
 
-def transformed(transform, points):
+def transformed(transform: Array, points: Array) -> jax.Array:
     """Points (..., 3) in one frame to another by (..., 4, 4) a_from_b, whose leading axes broadcast with theirs."""
     turned = matvec(transform[..., :3, :3], points)
     return turned + jnp.broadcast_to(transform[..., :3, 3], turned.shape)
 
 
-def rigid_inverse(transform):
+def rigid_inverse(transform: Array) -> jax.Array:
     """Inverse of (..., 4, 4) rigid transforms, by the transpose: exact to rounding."""
     rotation = jnp.swapaxes(transform[..., :3, :3], -1, -2)
     translation = -matvec(rotation, transform[..., :3, 3])
@@ -55,7 +57,7 @@ def rigid_inverse(transform):
     return jnp.concatenate([top, transform[..., 3:, :]], axis=-2)
 
 
-def intrinsics_inverse(intrinsics):
+def intrinsics_inverse(intrinsics: Array) -> jax.Array:
     """Inverse of (..., 3, 3) upper-triangular intrinsics in closed form; focal lengths must not be 0."""
     fx, skew, cx = intrinsics[..., 0, 0], intrinsics[..., 0, 1], intrinsics[..., 0, 2]
     fy, cy = intrinsics[..., 1, 1], intrinsics[..., 1, 2]
@@ -68,7 +70,7 @@ def intrinsics_inverse(intrinsics):
     return jnp.stack(rows, -2)
 
 
-def project(camera, points):
+def project(camera: Camera, points: Array) -> Projected:
     """World points to pixels.
 
     Args:
@@ -82,8 +84,9 @@ def project(camera, points):
     return project_in_camera(camera.intrinsics, transformed(camera.camera_from_world, points))
 
 
-def project_in_camera(intrinsics, points):
+def project_in_camera(intrinsics: Array, points: Array) -> Projected:
     """Points in the camera's own axes to pixels; see `project`."""
+    points = jnp.asarray(points)
     image = matvec(intrinsics, points)
     depth = points[..., 2]
     in_front = depth > NEAREST_DEPTH
@@ -91,7 +94,7 @@ def project_in_camera(intrinsics, points):
     return Projected(pixels, depth, in_front)
 
 
-def unproject(camera, pixels, depth):
+def unproject(camera: Camera, pixels: Array, depth: Array) -> jax.Array:
     """Pixels (..., 2) at depths (...) to world points (..., 3): the inverse of `project`."""
     check_shapes("unproject", pixels=(pixels, "... 2"), depth=(depth, "..."))
     homogeneous = jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
@@ -99,12 +102,12 @@ def unproject(camera, pixels, depth):
     return transformed(rigid_inverse(camera.camera_from_world), in_camera)
 
 
-def centre(camera):
+def centre(camera: Camera) -> jax.Array:
     """World position of the optical centre, (..., 3)."""
     return rigid_inverse(camera.camera_from_world)[..., :3, 3]
 
 
-def scaled(camera, factor_u, factor_v):
+def scaled(camera: Camera, factor_u: Scalar, factor_v: Scalar) -> Camera:
     """The camera of an image whose pixel (u, v) shows what (u / factor_u, v / factor_v) did: strided sampling.
 
     A feature map of stride 4 has factors 1/4: feature pixel j sits on image pixel 4 j.
@@ -112,7 +115,7 @@ def scaled(camera, factor_u, factor_v):
     return camera._replace(intrinsics=matmul(_pixel_map(camera, factor_u, factor_v, 0, 0), camera.intrinsics))
 
 
-def resized(camera, factor_u, factor_v):
+def resized(camera: Camera, factor_u: Scalar, factor_v: Scalar) -> Camera:
     """The camera of an area-resized image: pixel corners, not centres, keep their place.
 
     u_new = (u + 1/2) * factor_u - 1/2.
@@ -128,12 +131,12 @@ def _pixel_map(camera, factor_u, factor_v, shift_u, shift_v):
     return jnp.stack([jnp.stack([jnp.asarray(entry, dtype) for entry in row]) for row in rows])
 
 
-def relative(a, b):
+def relative(a: Camera, b: Camera) -> jax.Array:
     """(..., 4, 4) transform a_from_b between two cameras' axes."""
     return matmul(a.camera_from_world, rigid_inverse(b.camera_from_world))
 
 
-def look_at(position, target, *, up):
+def look_at(position: Array, target: Array, *, up: Array) -> jax.Array:
     """Pose of a camera at `position` that sees `target` in its centre, upright.
 
     Args:
@@ -160,7 +163,7 @@ def look_at(position, target, *, up):
     return _rigid(rotation, -matvec(rotation, position))
 
 
-def camera_from_opengl_pose(pose, height, width, focal):
+def camera_from_opengl_pose(pose: Array, height: Scalar, width: Scalar, focal: Scalar | Sequence[float]) -> Camera:
     """The camera of a pose in OpenGL's axes (x right, y up, z backward), principal point in the image's middle.
 
     Args:
@@ -191,7 +194,7 @@ def camera_from_opengl_pose(pose, height, width, focal):
     return Camera(intrinsics, _rigid(camera_from_world, -matvec(camera_from_world, pose[..., :3, 3])))
 
 
-def camera_from_llff_pose(pose):
+def camera_from_llff_pose(pose: Array) -> Camera:
     """The camera of a LLFF pose: (..., 3, 5) columns down, right, backward, position, and (height, width, focal).
 
     Returns:
@@ -207,7 +210,7 @@ def camera_from_llff_pose(pose):
     return camera_from_opengl_pose(opengl, size[..., 0], size[..., 1], size[..., 2])
 
 
-def check_camera(where, camera):
+def check_camera(where: str, camera: Camera) -> None:
     """Refuse cameras that no later stage could use. For arrays with values: call it before `jax.jit`, not inside.
 
     Args:
@@ -243,7 +246,7 @@ def check_camera(where, camera):
             raise ValueError(f"{where}: {fault}{f' (camera {at})' if at else ''}.")
 
 
-def check_bounds(where, near, far):
+def check_bounds(where: str, near: Scalar, far: Scalar) -> None:
     """Refuse depth bounds other than 0 < near < far < inf. For arrays with values, not under jit.
 
     Raises:

@@ -14,12 +14,24 @@ from jax import lax
 
 from zestjax.base.checks import check_shapes
 from zestjax.base.numerics import matvec
+from zestjax.base.types import Array
+from zestjax.frames.trust import Trust
 from zestjax.plane_statistics import CostVolume, Sweep, plane_statistics
 from zestjax.planesweep import sweep_grid, warp
 from zestjax.resample import bilinear
 
 
-def cost_volume(tables, homographies, grid, *, trust=None, depths=None, floor=1e-3, per_view=0, planes_at_once=1):
+def cost_volume(
+    tables: Array,
+    homographies: Array,
+    grid: Array,
+    *,
+    trust: Trust | None = None,
+    depths: Array | None = None,
+    floor: float = 1e-3,
+    per_view: int = 0,
+    planes_at_once: int = 1,
+) -> CostVolume:
     """Mean and centred variance over the views that see, and may be trusted at, each cell of a plane sweep.
 
     mean = sum_v w_v f_v / sum_v w_v,   variance = sum_v w_v (f_v - mean)^2 / sum_v w_v
@@ -78,7 +90,7 @@ def cost_volume(tables, homographies, grid, *, trust=None, depths=None, floor=1e
     return CostVolume(*(x.reshape(sizes["D"], *x.shape[2:]) for x in volume))
 
 
-def sweep_colours(images, homographies, grid):
+def sweep_colours(images: Array, homographies: Array, grid: Array) -> jax.Array:
     """Every view's colours on every plane, side by side: the colour half of the paper's volume.
 
     Where features are swept at the same resolution, `cost_volume(..., per_view=3)` returns them from the same gathers.
@@ -108,7 +120,9 @@ def sweep_colours(images, homographies, grid):
     return lax.map(plane, homographies).reshape(sizes["D"], sizes["h"], sizes["w"], -1)
 
 
-def mvsnerf_cost_volume(features, colours, homographies, *, padding=0, colour_views=None):
+def mvsnerf_cost_volume(
+    features: Array, colours: Array, homographies: Array, *, padding: int = 0, colour_views: int | None = None
+) -> jax.Array:
     """The cost volume that MVSNeRF's published weights were trained with, faults included.
 
     Channels: the reference's colours (not warped, 0 in the padding), the other views' warped colours, then
@@ -167,7 +181,7 @@ def _published_warp(table, homography, grid):
     return bilinear(table, pixels + 1).values, seen
 
 
-def quarter_colours(images):
+def quarter_colours(images: Array) -> jax.Array:
     """Images (..., H, W, 3) to the (..., H / 4, W / 4, 3) that MVSNeRF's volume holds: the middle 2 x 2 of every 4 x 4.
 
     Raises:

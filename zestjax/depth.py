@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
+from zestjax.base.types import Array, Scalar
 
 EMPTY = 1e-6  # opacity to which a ray's depth is that of what lies behind it
 FLAT = 1e-3  # mean absolute deviation, as a share of the median, under which a depth map is flat
@@ -38,7 +39,7 @@ class Whitened(NamedTuple):
     usable: jax.Array
 
 
-def expected_depth(weights, depths, *, background=None):
+def expected_depth(weights: Array, depths: Array, *, background: Scalar | None = None) -> jax.Array:
     """Mean depth of what a ray shows.
 
     Source: ZeST-NeRF eq. 20 (expected termination point); eq. 22 names it D.
@@ -67,7 +68,7 @@ def expected_depth(weights, depths, *, background=None):
     return total + (1 - opacity) * background
 
 
-def median_depth(weights, depths):
+def median_depth(weights: Array, depths: Array) -> jax.Array:
     """Depth of the sample at which half of the ray's opacity is reached; of the last one if it is empty.
 
     It is one of the samples' depths: no average of a near and a far surface. No gradient reaches `weights`.
@@ -90,7 +91,7 @@ def median_depth(weights, depths):
     return jnp.take_along_axis(depths, index[..., None], axis=-1)[..., 0]
 
 
-def disparity_from_depth(depth, *, nearest=1e-6):
+def disparity_from_depth(depth: Array, *, nearest: float = 1e-6) -> jax.Array:
     """1 / depth, with depths under `nearest` (world units) held there; 0 at an infinite depth.
 
     Reference: ZeST-NeRF renderer.py `raw2outputs` (`disp_map`), which is 0 / 0 on an empty ray.
@@ -98,7 +99,7 @@ def disparity_from_depth(depth, *, nearest=1e-6):
     return 1 / jnp.maximum(depth, nearest)
 
 
-def masked_median(values, mask):
+def masked_median(values: Array, mask: Array) -> jax.Array:
     """Median over the last axis of the values with a mask above 0; 0 where there are none.
 
     Of an even number of values it is the lower of the middle two, one of the values.
@@ -122,7 +123,7 @@ def masked_median(values, mask):
     return jnp.where(count > 0, found, 0)
 
 
-def whitened(values, mask, *, floor=FLAT):
+def whitened(values: Array, mask: Array, *, floor: float = FLAT) -> Whitened:
     """Remove a map's scale and shift robustly: subtract the median, divide by the mean absolute deviation.
 
     Reference: ZeST-NeRF losses.py `compute_depth_loss`; NSFF run_nerf_helpers.py.
@@ -152,7 +153,7 @@ def whitened(values, mask, *, floor=FLAT):
     return Whitened(values=seen / spread[..., None], centre=centre, spread=spread, usable=usable)
 
 
-def align_least_squares(values, target, mask):
+def align_least_squares(values: Array, target: Array, mask: Array) -> Alignment:
     """Scale and shift that bring `values` nearest to `target` in the masked mean of squares.
 
     Args:
@@ -183,7 +184,7 @@ def align_least_squares(values, target, mask):
     return Alignment(scale=scale, shift=target_mean - scale * values_mean)
 
 
-def align_robust(values, target, mask, *, floor=FLAT):
+def align_robust(values: Array, target: Array, mask: Array, *, floor: float = FLAT) -> Alignment:
     """Scale and shift that give `values` the target's median and mean absolute deviation: outliers matter little.
 
     Args:
@@ -204,6 +205,6 @@ def align_robust(values, target, mask, *, floor=FLAT):
     return Alignment(scale=scale, shift=theirs.centre - scale * ours.centre)
 
 
-def aligned(alignment, values):
+def aligned(alignment: Alignment, values: Array) -> jax.Array:
     """scale * values + shift, (..., P)."""
     return alignment.scale[..., None] * values + alignment.shift[..., None]

@@ -7,12 +7,14 @@ C        learned feature channels; a table holds C features, 3 colours, and of t
 votes    what the frames' own depths say about a cell: is it their surface, or do they look through it
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
+from zestjax.base.types import Array
 from zestjax.cameras import Camera
 from zestjax.cost_volume import cost_volume
 from zestjax.frames.trust import Trust, agreement
@@ -40,10 +42,10 @@ class SweepViews(NamedTuple):
     """tables: (V, h, w, C + colours + maps), see the header. cameras: `Camera` (V, ...) at the tables' resolution.
     valid: (V,) 1, or 0 for a slot the video does not fill. times: (V,) frame time minus target time, frames."""
 
-    tables: jax.Array
+    tables: Array
     cameras: Camera
-    valid: jax.Array
-    times: jax.Array
+    valid: Array
+    times: Array
 
 
 class Volume(NamedTuple):
@@ -51,7 +53,7 @@ class Volume(NamedTuple):
     logits: (D, h, w), a surface is here; None without guided sampling."""
 
     cells: jax.Array
-    logits: jax.Array | None
+    logits: Array | None
 
 
 class Votes(NamedTuple):
@@ -61,13 +63,24 @@ class Votes(NamedTuple):
     through: how clearly it looks through the cell, in [0, 1].
     """
 
-    seen: jax.Array
-    moving: jax.Array
-    surface: jax.Array
-    through: jax.Array
+    seen: Array
+    moving: Array
+    surface: Array
+    through: Array
 
 
-def init_volume(key, *, features, views, widths, colours, trusted, slots, pyramid_widths, occupied):
+def init_volume(
+    key: jax.Array,
+    *,
+    features: int,
+    views: int,
+    widths: Sequence[int],
+    colours: str,
+    trusted: bool,
+    slots: bool,
+    pyramid_widths: tuple[int, int, int] | None,
+    occupied: bool,
+) -> VolumeParams:
     """Parameters of one encoding volume.
 
     Args:
@@ -90,7 +103,7 @@ def init_volume(key, *, features, views, widths, colours, trusted, slots, pyrami
     return VolumeParams(pyramid, regulariser, init_dense(c, widths[0], 1, scale=0.1) if occupied else None)
 
 
-def cell_votes(samples, hom, grid, depths):
+def cell_votes(samples: Array, hom: Array, grid: Array, depths: Array) -> Votes:
     """`Votes` from the trust maps that each view shows at each cell.
 
     Args:
@@ -129,7 +142,17 @@ def _motion_votes(votes, times):
     return channels, VOTE_GAIN * heard(support - votes.through) / jnp.maximum(heard(votes.seen), LEAST_HEARD)
 
 
-def encode_volume(params, views, camera, size, depths, *, colours, trusted, slots):
+def encode_volume(
+    params: VolumeParams,
+    views: SweepViews,
+    camera: Camera,
+    size: tuple[int, int],
+    depths: Array,
+    *,
+    colours: str,
+    trusted: bool,
+    slots: bool,
+) -> Volume:
     """Sweep, compare, encode.
 
     Args:

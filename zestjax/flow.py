@@ -9,13 +9,15 @@
 A neighbour k frames away is reached in k steps, each by the flow found where the step before ended.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
-from zestjax.cameras import project
+from zestjax.base.types import Array
+from zestjax.cameras import Camera, project
 
 EMPTY = 1e-4  # opacity under which a ray shows too little to have an expected point
 
@@ -45,7 +47,7 @@ class OpticalFlow(NamedTuple):
     visible: jax.Array
 
 
-def follow(flow_at, points, valid):
+def follow(flow_at: Callable[[Array, int], jax.Array], points: Array, valid: Array) -> Path:
     """Follow points through neighbouring frames, each step by the flow at the place and time reached.
 
     Reference: ZeST-NeRF networks.py (`chain_bwd`), which follows one direction per call, by turns.
@@ -75,7 +77,7 @@ def follow(flow_at, points, valid):
     return Path(points=jnp.stack(reached), flows=jnp.stack(flows), valid=present)
 
 
-def world_flow(world_from_points, points, flow):
+def world_flow(world_from_points: Callable[[Array], jax.Array], points: Array, flow: Array) -> jax.Array:
     """A flow in the points' own coordinates as a displacement in world units.
 
     Args:
@@ -96,7 +98,13 @@ def world_flow(world_from_points, points, flow):
     return world_from_points(points + flow) - world_from_points(points)
 
 
-def advance(points, flow, *, world_from_points, points_from_world):
+def advance(
+    points: Array,
+    flow: Array,
+    *,
+    world_from_points: Callable[[Array], jax.Array],
+    points_from_world: Callable[[Array], jax.Array],
+) -> jax.Array:
     """Points moved by a flow in their own coordinates, in the coordinates of another frame.
 
     Args:
@@ -115,7 +123,7 @@ def advance(points, flow, *, world_from_points, points_from_world):
     return points_from_world(world_from_points(points + flow))
 
 
-def expected(weights, values, *, normalise=True):
+def expected(weights: Array, values: Array, *, normalise: bool = True) -> jax.Array:
     """Mean over a ray of a quantity of its samples.
 
     Source: ZeST-NeRF eq. 20.
@@ -139,7 +147,9 @@ def expected(weights, values, *, normalise=True):
     return total / jnp.maximum(jnp.sum(weights, axis=-1), EMPTY)[..., None]
 
 
-def optical_flow(weights, points, flow, camera, pixels, *, normalise=True):
+def optical_flow(
+    weights: Array, points: Array, flow: Array, camera: Camera, pixels: Array, *, normalise: bool = True
+) -> OpticalFlow:
     """Optical flow that a scene flow causes between a ray's pixel and a camera at the neighbouring time.
 
     Source: ZeST-NeRF eq. 20 and the projection in the text after it.

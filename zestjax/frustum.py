@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax.base.checks import check_option, check_shapes
+from zestjax.base.types import Array
 from zestjax.cameras import Camera, project, unproject
 from zestjax.rays import SPACINGS
 
@@ -25,8 +26,8 @@ class Frustum(NamedTuple):
     """camera: one `Camera`. near, far: () world units, 0 < near < far. height, width: of the camera's image, pixels."""
 
     camera: Camera
-    near: jax.Array | np.floating
-    far: jax.Array | np.floating
+    near: Array | np.floating
+    far: Array | np.floating
     height: int
     width: int
 
@@ -36,7 +37,7 @@ def _span(size):
     return jnp.maximum(jnp.asarray(size) - 1, 1)
 
 
-def frustum_from_world(frustum, points, *, spacing="depth"):
+def frustum_from_world(frustum: Frustum, points: Array, *, spacing: str = "depth") -> jax.Array:
     """World points to frustum coordinates.
 
     Args:
@@ -65,7 +66,7 @@ def frustum_from_world(frustum, points, *, spacing="depth"):
     return jnp.stack([x, y, z], axis=-1)
 
 
-def world_from_frustum(frustum, coords, *, spacing="depth"):
+def world_from_frustum(frustum: Frustum, coords: Array, *, spacing: str = "depth") -> jax.Array:
     """Frustum coordinates to world points: the inverse of `frustum_from_world` in front of the camera.
 
     Args:
@@ -94,7 +95,7 @@ def world_from_frustum(frustum, coords, *, spacing="depth"):
     return unproject(frustum.camera, jnp.stack([u, v], axis=-1), depth)
 
 
-def cells_from_frustum(coords, planes, h, w):
+def cells_from_frustum(coords: Array, planes: int, h: int, w: int) -> jax.Array:
     """Frustum coordinates (..., 3) x, y, z to cells (..., 3) plane, row, column of a (planes, h, w) volume.
 
     The volume's outer samples sit on the frustum's faces; what lies outside [0, 1] lies outside [0, size - 1].

@@ -14,6 +14,7 @@ import numpy as np
 
 from zestjax.base.checks import check_shapes
 from zestjax.base.numerics import safe_norm
+from zestjax.base.types import Array
 
 PSNR_CAP = 100.0
 """dB given to identical images, whose PSNR is infinite: no 8-bit image that differs at all reaches it."""
@@ -21,7 +22,7 @@ PSNR_CAP = 100.0
 SSIM_RADIUS, SSIM_SIGMA = 5, 1.5
 
 
-def psnr(image, truth, *, mask=None):
+def psnr(image: Array, truth: Array, *, mask: Array | None = None) -> jax.Array:
     """Peak signal-to-noise ratio in dB for values in [0, 1], at most `PSNR_CAP`.
 
     Source: ZeST-NeRF eq. 23, eq. 24.
@@ -42,7 +43,7 @@ def psnr(image, truth, *, mask=None):
     return -10 * jnp.log10(jnp.maximum(error, 10 ** (-PSNR_CAP / 10)))
 
 
-def ssim(image, truth, *, mask=None):
+def ssim(image: Array, truth: Array, *, mask: Array | None = None) -> jax.Array:
     """Mean structural similarity: see `ssim_map`. The 5 outer pixels, whose windows leave the image, do not count.
 
     Args:
@@ -64,7 +65,7 @@ def ssim(image, truth, *, mask=None):
     return mean_where(similarity[inside, inside], mask, where="ssim")
 
 
-def ssim_map(image, truth):
+def ssim_map(image: Array, truth: Array) -> jax.Array:
     """Structural similarity of every pixel and channel for values in [0, 1].
 
     Gaussian window 11 x 11 of sigma 1.5, images mirrored at the border, biased variances. Variances are centred in each
@@ -98,7 +99,7 @@ def ssim_map(image, truth):
     return luminance * (2 * covariance + c2) / (variance_a + variance_b + c2)
 
 
-def depth_abs_rel(depth, truth, mask):
+def depth_abs_rel(depth: Array, truth: Array, mask: Array | None) -> jax.Array:
     """Mean of |depth - truth| / truth over the mask, of pixels whose true depth is finite and > 0.
 
     Args:
@@ -119,7 +120,7 @@ def depth_abs_rel(depth, truth, mask):
     return mean_where(relative, mask, where="depth_abs_rel")
 
 
-def endpoint_error(flow, truth, mask):
+def endpoint_error(flow: Array, truth: Array, mask: Array | None) -> jax.Array:
     """Mean length of the difference of two optical flows over the mask, of pixels whose true flow is finite.
 
     Args:
@@ -163,7 +164,7 @@ def _window_moments(*moments):
     return mean_a, mean_b, *average(spread)
 
 
-def mean_where(x, mask, *, where):
+def mean_where(x: Array, mask: Array | None, *, where: str) -> jax.Array:
     """Mean of x (H, W) under the mask, None for all; NaN when it is empty. x may be non-finite outside the mask."""
     if mask is None:
         return _mean(x)

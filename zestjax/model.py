@@ -6,11 +6,21 @@ frames to volumes to fields to pixels: `systems.system.System.encode`, then `Sys
 
 import jax
 
+from zestjax.base.types import Array
+from zestjax.frames.analysis import FrameMaps
 from zestjax.systems.system import Params, Prediction, System
 from zestjax.video import Inputs
 
 
-def predict(params: Params, inputs: Inputs, maps, pixels: jax.Array, *, system: System, jitter=None) -> Prediction:
+def predict(
+    params: Params,
+    inputs: Inputs,
+    maps: FrameMaps | None,
+    pixels: jax.Array,
+    *,
+    system: System,
+    jitter: Array | None = None,
+) -> Prediction:
     """Render pixels of a target from its inputs; pure, of one scene and one target, compiled and mapped as you like.
 
     Args:

@@ -6,6 +6,7 @@ exclude  frames that must serve nothing, because they are what is to be predicte
 """
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,8 @@ import numpy as np
 
 from zestjax.base.checks import check_known, check_types, traced
 from zestjax.base.precision import geometry_at, network_at
-from zestjax.cameras import project
+from zestjax.base.types import Array
+from zestjax.cameras import Camera, project
 from zestjax.frames.analysis import FrameMaps
 from zestjax.frames.assembly import Footage, dequantised, footage, video_evidence
 from zestjax.frames.inputs import check_exclude, check_inputs, check_view
@@ -68,7 +70,7 @@ def _frame_maps(params, seen, video, system, *, frames=None, exclude=()):
     return _maps(params.analysis, evidence, system=system)
 
 
-def prepare(params: Params, video: Video, *, system: System, exclude=()) -> Prepared:
+def prepare(params: Params, video: Video, *, system: System, exclude: Sequence[int] = ()) -> Prepared:
     """What a scene is asked for every view: each frame's own depth and moving pixels.
 
     Args:
@@ -117,7 +119,15 @@ def check_params(where: str, params: Params, system: System) -> None:
         raise ValueError(f"{where}: `params` have `{more[0]}`, which `system` lacks; give the weights' own system.")
 
 
-def render_view(params: Params, prepared: Prepared, camera, time, *, system: System, exclude=()) -> View:
+def render_view(
+    params: Params,
+    prepared: Prepared,
+    camera: Camera,
+    time: int | Array,
+    *,
+    system: System,
+    exclude: Sequence[int] = (),
+) -> View:
     """A view from a camera at a time of the video; pure after `prepare`, for `jit`, `vmap` over cameras and times, and
     `grad` (which frames serve, and where guided rays are sampled, is held).
 
@@ -160,7 +170,9 @@ def render_view(params: Params, prepared: Prepared, camera, time, *, system: Sys
 
 
 @functools.partial(jax.jit, static_argnames=("system", "rows"))
-def render_inputs(params: Params, inputs: Inputs, maps: FrameMaps | None, *, system: System, rows=None) -> View:
+def render_inputs(
+    params: Params, inputs: Inputs, maps: FrameMaps | None, *, system: System, rows: int | None = None
+) -> View:
     """The view of given inputs; a pure function, compiled once for a size and a system.
 
     Args:

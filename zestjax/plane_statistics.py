@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
+from zestjax.base.types import Array
 from zestjax.frames.trust import trusted
 from zestjax.planesweep import carry
 from zestjax.resample import bilinear_cells, corner_offsets, gather_corners, interpolate
@@ -174,7 +175,7 @@ _streamed = jax.custom_vjp(_stream, nondiff_argnums=(0,))
 _streamed.defvjp(_stream_forward, _stream_backward, symbolic_zeros=True)
 
 
-def plane_statistics(sweep, flat, homographies, depths, grid):
+def plane_statistics(sweep: Sweep, flat: Array, homographies: Array, depths: Array, grid: Array) -> CostVolume:
     """`CostVolume` with leading axes (n, b), of arguments as the header names them; the kernel of `cost_volume`.
 
     Reverse-mode gradients flow to `flat` and `homographies`; that of the latter is computed only where it is asked for.

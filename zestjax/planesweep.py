@@ -8,15 +8,17 @@ grid          (h, w, 3) homogeneous reference pixels (u, v, 1)
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from zestjax.base.checks import check_shapes
 from zestjax.base.numerics import matmul, matvec
-from zestjax.cameras import NEAREST_DEPTH, intrinsics_inverse, relative
+from zestjax.base.types import Array, Scalar
+from zestjax.cameras import NEAREST_DEPTH, Camera, intrinsics_inverse, relative
 from zestjax.rays import pixel_grid, regular_depths
-from zestjax.resample import bilinear
+from zestjax.resample import Sampled, bilinear
 
 
-def plane_depths(near, far, count, *, spacing="depth"):
+def plane_depths(near: Scalar, far: Scalar, count: int, *, spacing: str = "depth") -> jax.Array:
     """(D,) depths of the planes, near and far included; `spacing` is `depth` or `inverse`: what they are even in.
 
     Raises:
@@ -25,13 +27,13 @@ def plane_depths(near, far, count, *, spacing="depth"):
     return regular_depths(near, far, count, spacing=spacing)
 
 
-def sweep_grid(height, width, *, padding=0, dtype=jnp.float32):
+def sweep_grid(height: int, width: int, *, padding: int = 0, dtype: DTypeLike = jnp.float32) -> jax.Array:
     """(h + 2 padding, w + 2 padding, 3) homogeneous reference pixels; those of the padding lie outside the image."""
     pixels = pixel_grid(height + 2 * padding, width + 2 * padding, dtype=dtype) - padding
     return jnp.concatenate([pixels, jnp.ones_like(pixels[..., :1])], axis=-1)
 
 
-def plane_homography(reference, source, depth):
+def plane_homography(reference: Camera, source: Camera, depth: Scalar) -> jax.Array:
     """Homography from reference pixels to source pixels through the plane z = depth of the reference camera.
 
     H(d) = K_s (R + t n^T / d) K_r^-1, with [R | t] = source_from_reference and n = (0, 0, 1). Its scale is fixed: for a
@@ -64,7 +66,7 @@ def plane_homography(reference, source, depth):
     return turn.at[:, 2].add(matvec(source.intrinsics, translation) / depth)
 
 
-def homographies(reference, sources, depths):
+def homographies(reference: Camera, sources: Camera, depths: Array) -> jax.Array:
     """`plane_homography` of V sources at D depths.
 
     Args:
@@ -83,7 +85,7 @@ def homographies(reference, sources, depths):
     return jax.vmap(per_source, in_axes=(None, None, 0))(reference, sources, depths)
 
 
-def carry(homography, grid):
+def carry(homography: Array, grid: Array) -> tuple[jax.Array, jax.Array, Array, Array]:
     """Source pixels of a grid, written elementwise: true float32 on every backend, and it fuses with what follows.
 
     Args:
@@ -103,7 +105,7 @@ def carry(homography, grid):
     return jnp.where(in_front, row(0), 0) / safe, jnp.where(in_front, row(1), 0) / safe, share, in_front
 
 
-def warp(image, homography, grid):
+def warp(image: Array, homography: Array, grid: Array) -> Sampled:
     """A source image seen on one plane of the reference camera.
 
     Args:

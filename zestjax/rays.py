@@ -10,10 +10,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from zestjax.base.checks import check_option, check_shapes
 from zestjax.base.numerics import matvec
-from zestjax.cameras import centre, intrinsics_inverse
+from zestjax.base.types import Array, Scalar
+from zestjax.cameras import Camera, centre, intrinsics_inverse
 
 SPACINGS = ("depth", "inverse")
 
@@ -35,13 +37,13 @@ class DrawnPixels(NamedTuple):
     available: jax.Array
 
 
-def pixel_grid(height, width, *, dtype=jnp.float32):
+def pixel_grid(height: int, width: int, *, dtype: DTypeLike = jnp.float32) -> jax.Array:
     """(H, W, 2) column and row of every pixel."""
     v, u = jnp.meshgrid(jnp.arange(height, dtype=dtype), jnp.arange(width, dtype=dtype), indexing="ij")
     return jnp.stack([u, v], axis=-1)
 
 
-def rays_from_pixels(camera, pixels):
+def rays_from_pixels(camera: Camera, pixels: Array) -> Rays:
     """Rays from the optical centre through pixels.
 
     Args:
@@ -61,7 +63,7 @@ def rays_from_pixels(camera, pixels):
     return Rays(jnp.broadcast_to(centre(camera), directions.shape), directions)
 
 
-def depths_from_fractions(fractions, near, far, *, spacing="depth"):
+def depths_from_fractions(fractions: Array, near: Scalar, far: Scalar, *, spacing: str = "depth") -> jax.Array:
     """Fractions in [0, 1], any shape, to depths from near (at 0) to far (at 1).
 
     Args:
@@ -75,11 +77,11 @@ def depths_from_fractions(fractions, near, far, *, spacing="depth"):
     """
     check_option("depths_from_fractions", spacing=(spacing, SPACINGS))
     if spacing == "depth":
-        return near * (1 - fractions) + far * fractions
-    return 1 / ((1 - fractions) / near + fractions / far)
+        return jnp.asarray(near * (1 - fractions) + far * fractions)
+    return jnp.asarray(1 / ((1 - fractions) / near + fractions / far))
 
 
-def regular_depths(near, far, count, *, spacing="depth"):
+def regular_depths(near: Scalar, far: Scalar, count: int, *, spacing: str = "depth") -> jax.Array:
     """(S,) depths from near to far, both included; the middle one (in the spacing) if count is 1.
 
     Raises:
@@ -92,7 +94,9 @@ def regular_depths(near, far, count, *, spacing="depth"):
     return depths_from_fractions(fractions, near, far, spacing=spacing)
 
 
-def stratified_depths(key, near, far, count, rays, *, spacing="depth"):
+def stratified_depths(
+    key: jax.Array, near: Scalar, far: Scalar, count: int, rays: int, *, spacing: str = "depth"
+) -> jax.Array:
     """One uniform draw in each of `count` equal strata between near and far.
 
     Args:
@@ -119,7 +123,7 @@ def stratified_depths(key, near, far, count, rays, *, spacing="depth"):
     return depths_from_fractions(fractions, near, far, spacing=spacing)
 
 
-def interval_lengths(depths, near, far):
+def interval_lengths(depths: Array, near: Scalar, far: Scalar) -> jax.Array:
     """Length of the interval that each sample stands for: its borders are the midpoints, near and far.
 
     Args:
@@ -138,7 +142,7 @@ def interval_lengths(depths, near, far):
     return jnp.diff(jnp.concatenate([end(near), middles, end(far)], axis=-1), axis=-1)
 
 
-def sample_pixels(key, mask, count):
+def sample_pixels(key: jax.Array, mask: Array, count: int) -> DrawnPixels:
     """Pixels drawn uniformly, with replacement, from those where a mask is set; works under jit.
 
     Args:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 
 from zestjax.base.checks import check_option, check_shapes
 from zestjax.base.numerics import exclusive_cumprod, exclusive_cumsum
+from zestjax.base.types import Array, Tree
 from zestjax.depth import expected_depth
 
 BLEND_FORMS = ("opacity", "density")
@@ -35,7 +36,7 @@ class Rendered(NamedTuple):
 
     values: Any
     opacity: jax.Array
-    weights: jax.Array
+    weights: Array
 
 
 class Blended(NamedTuple):
@@ -52,8 +53,8 @@ class Blended(NamedTuple):
 class FieldSamples(NamedTuple):
     """What a field says along the rays. density: (..., S). colour: (..., S, 3) in [0, 1]."""
 
-    density: jax.Array
-    colour: jax.Array
+    density: Array
+    colour: Array
 
 
 class BlendedRender(NamedTuple):
@@ -79,7 +80,7 @@ class BlendedRender(NamedTuple):
     dynamic_weights: jax.Array
 
 
-def alpha_from_density(density, lengths):
+def alpha_from_density(density: Array, lengths: Array) -> jax.Array:
     """Opacity of an interval, 1 - exp(-density * length).
 
     `expm1` keeps the small opacities that `1 - exp(-x)` rounds to zero.
@@ -91,7 +92,7 @@ def alpha_from_density(density, lengths):
     return -jnp.expm1(-jnp.multiply(*jnp.broadcast_arrays(density, lengths)))
 
 
-def weights_from_density(density, lengths):
+def weights_from_density(density: Array, lengths: Array) -> jax.Array:
     """Compositing weights w_s = alpha_s * exp(-sum_{r<s} density_r length_r) of one field.
 
     Source: ZeST-NeRF eq. 12; NeRF (Mildenhall et al. 2020), eq. 3.
@@ -117,7 +118,7 @@ def weights_from_density(density, lengths):
     return -jnp.expm1(-thickness) * jnp.exp(-exclusive_cumsum(thickness))
 
 
-def blend_weights(static_alpha, dynamic_alpha, blend):
+def blend_weights(static_alpha: Array, dynamic_alpha: Array, blend: Array) -> Blended:
     """Weights of a static and a dynamic field mixed on one ray: `blend` scales each sample's opacity.
 
     Source: ZeST-NeRF eq. 7, eq. 8; NSFF (Li et al. 2021), section 3.3.
@@ -149,7 +150,7 @@ def blend_weights(static_alpha, dynamic_alpha, blend):
     return Blended(static=reaching * static, dynamic=reaching * dynamic)
 
 
-def density_blend_weights(static_density, dynamic_density, blend, lengths):
+def density_blend_weights(static_density: Array, dynamic_density: Array, blend: Array, lengths: Array) -> Blended:
     """Weights of two fields on one ray as the paper prints them: `blend` scales densities in the transmittance.
 
     Source: ZeST-NeRF eq. 9 for the transmittance, with eq. 7 and eq. 8 for the opacities.
@@ -182,7 +183,9 @@ def density_blend_weights(static_density, dynamic_density, blend, lengths):
     return Blended(static=reaching * (1 - blend) * -jnp.expm1(-static), dynamic=reaching * blend * -jnp.expm1(-dynamic))
 
 
-def blend_weights_from_density(static_density, dynamic_density, blend, lengths, *, form="opacity"):
+def blend_weights_from_density(
+    static_density: Array, dynamic_density: Array, blend: Array, lengths: Array, *, form: str = "opacity"
+) -> Blended:
     """`blend_weights` or `density_blend_weights` of two fields' densities.
 
     Args:
@@ -205,7 +208,7 @@ def blend_weights_from_density(static_density, dynamic_density, blend, lengths, 
     return blend_weights(static_alpha, alpha_from_density(dynamic_density, lengths), blend)
 
 
-def composite(weights, values, *, background=None):
+def composite(weights: Array, values: Tree, *, background: Tree = None) -> Rendered:
     """Weighted sum of `values` along the ray, over an optional background.
 
     Reference: ZeST-NeRF renderer.py `raw2outputs`.
@@ -236,7 +239,7 @@ def composite(weights, values, *, background=None):
     return Rendered(values=values, opacity=opacity, weights=weights)
 
 
-def confidence_map(weights, confidence, *, hold_weights=True):
+def confidence_map(weights: Array, confidence: Array, *, hold_weights: bool = True) -> jax.Array:
     """Confidence seen by each ray, sum_s weights_s * confidence_s.
 
     Source: ZeST-NeRF eq. 13.
@@ -259,7 +262,9 @@ def confidence_map(weights, confidence, *, hold_weights=True):
     return jnp.sum(weights * confidence, axis=-1)
 
 
-def render_blended(static, dynamic, blend, lengths, depths, *, form="opacity"):
+def render_blended(
+    static: FieldSamples, dynamic: FieldSamples, blend: Array, lengths: Array, depths: Array, *, form: str = "opacity"
+) -> BlendedRender:
     """Render two fields that share their rays: blended, and each alone.
 
     Source: ZeST-NeRF eq. 7, eq. 8.

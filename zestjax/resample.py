@@ -9,12 +9,14 @@ Whole rows are gathered from one flat table, one gather per corner: on a CPU the
 is five times faster than `jax.scipy.ndimage.map_coordinates`'s. Both readers differentiate in forward and reverse mode.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_option, check_shapes
+from zestjax.base.types import Array
 
 EDGE = 1e-3  # pixels: rounding of a float32 homography; a point this far outside still counts as on the border
 
@@ -22,8 +24,8 @@ EDGE = 1e-3  # pixels: rounding of a float32 homography; a point this far outsid
 class Sampled(NamedTuple):
     """values: (..., C), 0 where not visible if the border is zero. visible: (...) bool, the point is inside."""
 
-    values: jax.Array
-    visible: jax.Array
+    values: Array
+    visible: Array
 
 
 class Cells(NamedTuple):
@@ -40,7 +42,7 @@ class Cells(NamedTuple):
     inside: jax.Array
 
 
-def corner_offsets(*shape):
+def corner_offsets(*shape: int) -> tuple[int, ...]:
     """Table offsets from a cell's first corner to all its corners, last axis fastest; an axis of 1 has one corner."""
     offsets, stride = (0,), 1
     for size in reversed(shape):
@@ -50,7 +52,7 @@ def corner_offsets(*shape):
     return offsets
 
 
-def split(coordinate, size):
+def split(coordinate: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
     """(...,) coordinates on an axis of `size` samples to the (int32) lower sample and the fraction above it.
 
     A NaN keeps its fraction NaN but reads sample 0, so that no address leaves the table.
@@ -60,24 +62,26 @@ def split(coordinate, size):
     return lower.astype(jnp.int32), coordinate - lower
 
 
-def bilinear_cells(u, v, height, width):
+def bilinear_cells(u: Array, v: Array, height: int, width: int) -> Cells:
     """Columns u and rows v, both (...), to the `Cells` they fall in, clamped to the image's border.
 
     A point counts as inside up to 0.001 pixels beyond the outer samples.
     """
+    u, v = jnp.asarray(u), jnp.asarray(v)
     inside = (u >= -EDGE) & (u <= width - 1 + EDGE) & (v >= -EDGE) & (v <= height - 1 + EDGE)
     column, across = split(jnp.clip(u, 0, width - 1), width)
     row, down = split(jnp.clip(v, 0, height - 1), height)
     return Cells(row * width + column, across, down, inside)
 
 
-def gather_corners(table, first, offsets):
+def gather_corners(table: Array, first: Array, offsets: Sequence[int]) -> tuple[jax.Array, ...]:
     """One gather of whole rows per corner: table (rows, C), first (...) int32 -> a tuple of (..., C)."""
-    read = lambda offset: table.at[first + offset].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    rows = jnp.asarray(table).at
+    read = lambda offset: rows[first + offset].get(mode="promise_in_bounds", wrap_negative_indices=False)
     return tuple(read(offset) for offset in offsets)
 
 
-def interpolate(corners, across, down):
+def interpolate(corners: Sequence[jax.Array], across: jax.Array, down: jax.Array) -> jax.Array:
     """Blend a cell's four corners (..., C) by the fractions (...); exact where these are 0 or 1."""
     across, down = across[..., None], down[..., None]
     upper_left, upper_right, lower_left, lower_right = corners
@@ -86,7 +90,7 @@ def interpolate(corners, across, down):
     return upper * (1 - down) + lower * down
 
 
-def bilinear(image, pixels, *, border="zero"):
+def bilinear(image: Array, pixels: Array, *, border: str = "zero") -> Sampled:
     """Read an image between its pixels.
 
     Args:
@@ -116,7 +120,7 @@ def bilinear(image, pixels, *, border="zero"):
     return Sampled(values, cells.inside)
 
 
-def trilinear(volume, cells, *, border="clamp"):
+def trilinear(volume: Array, cells: Array, *, border: str = "clamp") -> jax.Array:
     """Read a volume between its samples.
 
     Args:

@@ -13,16 +13,17 @@ calls: they ask for it at many places, and a compiled loop would hold, and compi
 
 import dataclasses
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from zestjax.adam import adam, init_adam
+from zestjax.adam import AdamState, adam, init_adam
 from zestjax.base.checks import check_option, traced
 from zestjax.base.trees import tree_norm
+from zestjax.base.types import Array, Tree
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "JAXopt is no longer", DeprecationWarning)
@@ -63,7 +64,7 @@ class Adam(StochasticSolver):
     """
 
     fun: Callable | None = None
-    learning_rate: Any = 5e-4
+    learning_rate: float | Callable = 5e-4
     b1: float = 0.9
     b2: float = 0.999
     eps: float = 1e-8
@@ -93,7 +94,7 @@ class Adam(StochasticSolver):
         pair = self.fun if self.has_aux else lambda *a, **k: (self.fun(*a, **k), None)  # type: ignore[misc]
         return jax.value_and_grad(pair, has_aux=True)(params, *args, **kwargs)
 
-    def init_state(self, init_params, *args, **kwargs):
+    def init_state(self, init_params: Tree, *args: Any, **kwargs: Any) -> AdamState:
         """The state before the first update; `aux` is zeros of its shape if `fun`'s arguments are given, else None."""
         if self.fun is None or not (args or kwargs):
             return init_adam(init_params)
@@ -101,12 +102,12 @@ class Adam(StochasticSolver):
         aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
         return init_adam(init_params, value_dtype=value.dtype, aux=aux)
 
-    def update(self, params, state, *args, **kwargs):
+    def update(self, params: Tree, state: AdamState, *args: Any, **kwargs: Any) -> OptStep:
         """One step on `fun(params, *args, **kwargs)`; returns jaxopt's `OptStep(params, state)`."""
         (value, aux), grads = self._value_and_grad(params, *args, **kwargs)
         return self.apply(params, state, grads, value, aux=aux)
 
-    def apply(self, params, state, grads, value, *, aux=None):
+    def apply(self, params: Tree, state: AdamState, grads: Tree, value: Array, *, aux: Tree = None) -> OptStep:
         """One step with a gradient already at hand.
 
         Args:
@@ -134,12 +135,22 @@ class Adam(StochasticSolver):
         )
         return OptStep(params=params, state=state)
 
-    def optimality_fun(self, params, *args, **kwargs):
+    def optimality_fun(self, params: Tree, *args: Any, **kwargs: Any) -> Tree:
         """The gradient, which is 0 at a solution: what jaxopt differentiates implicitly."""
         return self._value_and_grad(params, *args, **kwargs)[1]
 
 
-def fit_lbfgs(objective, params, batch, weights, *, max_steps=100, tol=1e-4, history=10, linesearch="backtracking"):
+def fit_lbfgs(
+    objective: Callable,
+    params: Tree,
+    batch: Tree,
+    weights: Mapping[str, Any],
+    *,
+    max_steps: int = 100,
+    tol: float = 1e-4,
+    history: int = 10,
+    linesearch: str = "backtracking",
+) -> Fit:
     """Minimise `objective` over `params` with L-BFGS: the last mile, on a batch that does not change.
 
     May be `vmap`ped over batches or arrays of weights. Not differentiable in reverse.
@@ -165,7 +176,17 @@ def fit_lbfgs(objective, params, batch, weights, *, max_steps=100, tol=1e-4, his
     return _run(jaxopt.LBFGS, options, objective, params, batch, weights)
 
 
-def fit_gradient(objective, params, batch, weights, *, max_steps=500, tol=1e-4, stepsize=0.0, acceleration=True):
+def fit_gradient(
+    objective: Callable,
+    params: Tree,
+    batch: Tree,
+    weights: Mapping[str, Any],
+    *,
+    max_steps: int = 500,
+    tol: float = 1e-4,
+    stepsize: float = 0.0,
+    acceleration: bool = True,
+) -> Fit:
     """Minimise `objective` over `params` by gradient descent with a line search.
 
     Args:
@@ -185,7 +206,16 @@ def fit_gradient(objective, params, batch, weights, *, max_steps=500, tol=1e-4, 
     return _run(jaxopt.GradientDescent, options, objective, params, batch, weights)
 
 
-def fit_adam(objective, params, batches, weights, *, learning_rate=5e-4, clip_norm=1.0, tol=0.0):
+def fit_adam(
+    objective: Callable,
+    params: Tree,
+    batches: Tree,
+    weights: Mapping[str, Any],
+    *,
+    learning_rate: float | Callable = 5e-4,
+    clip_norm: float | None = 1.0,
+    tol: float = 0.0,
+) -> Fit:
     """One pass of `Adam` over `batches`, in one compiled loop.
 
     Args:
@@ -206,7 +236,15 @@ def fit_adam(objective, params, batches, weights, *, learning_rate=5e-4, clip_no
     return _pass(solver, params, batches, tol)
 
 
-def fit_armijo(objective, params, batches, weights, *, max_stepsize=1.0, tol=0.0):
+def fit_armijo(
+    objective: Callable,
+    params: Tree,
+    batches: Tree,
+    weights: Mapping[str, Any],
+    *,
+    max_stepsize: float = 1.0,
+    tol: float = 0.0,
+) -> Fit:
     """One pass of jaxopt's `ArmijoSGD` over `batches`: no learning rate to choose, 2-4 evaluations a step.
 
     Args:
@@ -226,7 +264,14 @@ def fit_armijo(objective, params, batches, weights, *, max_stepsize=1.0, tol=0.0
     return _pass(solver, params, batches, tol)
 
 
-def fit_least_squares(residual, params, *args, method="levenberg_marquardt", max_steps=50, tol=1e-6):
+def fit_least_squares(
+    residual: Callable,
+    params: Tree,
+    *args: Tree,
+    method: str = "levenberg_marquardt",
+    max_steps: int = 50,
+    tol: float = 1e-6,
+) -> Fit:
     """Minimise the sum of squares of `residual(params, *args)`: poses, alignments, few parameters.
 
     Args:

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from zestjax.base.checks import check_known, check_shapes, check_types
+from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera, check_bounds, check_camera
 
 ROUNDING = 1e-4  # by which a colour may leave [0, 1]: a resize exceeds it by its sums' rounding, and no eye sees it
@@ -19,20 +20,20 @@ class Video(NamedTuple):
     """images: (N, H, W, 3) RGB in [0, 1]. cameras: `Camera` with (N, ...) leaves. near, far: () depth bounds
     of the whole scene, world units, 0 < near < far."""
 
-    images: jax.Array
+    images: Array
     cameras: Camera
-    near: jax.Array
-    far: jax.Array
+    near: Scalar
+    far: Scalar
 
 
 class Frames(NamedTuple):
     """Frames of a video that serve a target. images: (V, H, W, 3). cameras: `Camera` (V, ...). valid: (V,) 1, or 0 of
     what is not there and only fills its place. times: (V,) frame times."""
 
-    images: jax.Array
+    images: Array
     cameras: Camera
-    valid: jax.Array
-    times: jax.Array
+    valid: Array
+    times: Array
 
 
 class Inputs(NamedTuple):
@@ -43,13 +44,13 @@ class Inputs(NamedTuple):
     key: Frames
     slots: Frames | None
     camera: Camera
-    time: jax.Array | np.floating
-    duration: jax.Array | np.floating
-    near: jax.Array | np.floating
-    far: jax.Array | np.floating
+    time: Array | np.floating
+    duration: Array | np.floating
+    near: Array | np.floating
+    far: Array | np.floating
 
 
-def check_video(where, video, *, quantised=False):
+def check_video(where: str, video: Video, *, quantised: bool = False) -> Video:
     """Refuse a video that no later stage could use. For arrays with values: call it before `jax.jit`, not inside.
 
     Args:

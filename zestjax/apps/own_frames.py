@@ -49,7 +49,7 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
         order = np.random.default_rng([seed, rounds]).permutation(usable)
         holes = tuple(int(i) for i in np.roll(order, -place)[:size])
         evidence = None
-        if maps is not None:
+        if maps is not None and seen is not None:
             evidence = video_evidence(
                 seen, cameras, known.near, known.far, planes=maps.planes, exclude=(*holes, *exclude)
             )

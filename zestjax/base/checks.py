@@ -1,12 +1,15 @@
 """Checks of arguments: of shapes, types and options. They run while JAX traces, and cost nothing once compiled."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
 
 
-def check_shapes(where, /, **arrays):
+def check_shapes(where: str, /, **arrays: tuple[Any, str]) -> dict[str, int]:
     """Match each array's trailing axes to a spec; raise with the axis's name.
 
     Args:
@@ -44,7 +47,7 @@ def check_shapes(where, /, **arrays):
     return sizes
 
 
-def pose_hint(shape, wanted):
+def pose_hint(shape: Sequence[int], wanted: Sequence[str | int | None]) -> str:
     """A sentence on what a 3x4 pose lacks where a 4x4 one is wanted, else nothing; `wanted`: sizes of the axes."""
     meant = tuple(shape[-2:]) == (3, 4) and [str(size) for size in wanted[-2:]] == ["4", "4"]
     return " A 3x4 pose needs the row 0 0 0 1 under it." if meant else ""
@@ -58,7 +61,7 @@ def _check_batches(where, batches):
         raise ValueError(f"{where}: batch axes that do not broadcast: {listed}.") from None
 
 
-def check_option(where, /, **options):
+def check_option(where: str, /, **options: tuple[Any, Sequence[Any]]) -> None:
     """Refuse a value that is not one of the listed ones: `check_option("f", head=(head, ("blend", "direct")))`.
 
     Raises:
@@ -70,7 +73,7 @@ def check_option(where, /, **options):
             raise ValueError(f"{where}: `{name}` is {value!r}, expected one of {listed}.")
 
 
-def check_types(where, /, **values):
+def check_types(where: str, /, **values: tuple[Any, type]) -> None:
     """Refuse a value that is not of its type: `check_types("f", video=(video, Video))`.
 
     Raises:
@@ -81,12 +84,12 @@ def check_types(where, /, **values):
             raise ValueError(f"{where}: `{name}` should be a `{wanted.__name__}`, got `{type(value).__name__}`.")
 
 
-def traced(tree):
+def traced(tree: Any) -> bool:
     """Whether anything of a tree has no values yet, because JAX is tracing it."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def check_known(where, /, **trees):
+def check_known(where: str, /, **trees: Any) -> None:
     """Refuse what has no values yet because it is being traced, where a choice depends on the values.
 
     Raises:
@@ -100,7 +103,7 @@ def check_known(where, /, **trees):
             )
 
 
-def check_counts(where, /, **counts):
+def check_counts(where: str, /, **counts: tuple[Any, int, int]) -> None:
     """Refuse what is no whole number of a range: `check_counts("Space", planes=(planes, 2, 512))`.
 
     Raises:

@@ -3,13 +3,19 @@
 Each is named for what it guarantees; the test beside it goes to the point where the naive form breaks.
 """
 
+import functools
+import operator
+from collections.abc import Iterable
+
 import jax
 import jax.numpy as jnp
+
+from zestjax.base.types import Array, Scalar
 
 HIGHEST = jax.lax.Precision.HIGHEST
 
 
-def exclusive_cumsum(x):
+def exclusive_cumsum(x: Array) -> jax.Array:
     """Running sum of the entries before each one, on the last axis; starts at 0.
 
     Not `cumsum(x) - x`: a large last entry (the reference closes every ray with a 1e10 interval) would
@@ -19,24 +25,24 @@ def exclusive_cumsum(x):
     return jnp.concatenate([zero, jnp.cumsum(x[..., :-1], axis=-1)], axis=-1)
 
 
-def exclusive_cumprod(x):
+def exclusive_cumprod(x: Array) -> jax.Array:
     """Running product of the entries before each one, on the last axis; starts at 1."""
     ones = jnp.ones_like(x[..., :1])
     return jnp.cumprod(jnp.concatenate([ones, x[..., :-1]], axis=-1), axis=-1)
 
 
-def safe_sqrt(x):
+def safe_sqrt(x: Array) -> jax.Array:
     """Square root of x >= 0 whose gradient at 0 is 0 rather than infinite."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
 
 
-def safe_norm(x, *, axis=-1, keepdims=False):
+def safe_norm(x: Array, *, axis: int = -1, keepdims: bool = False) -> jax.Array:
     """Euclidean norm whose gradient at x = 0 is 0 rather than NaN."""
     return safe_sqrt(jnp.sum(x * x, axis=axis, keepdims=keepdims))
 
 
-def safe_divide(numerator, denominator, *, otherwise=0.0):
+def safe_divide(numerator: Scalar, denominator: Scalar, *, otherwise: Scalar = 0.0) -> jax.Array:
     """numerator / denominator; `otherwise`, with a 0 gradient, where the denominator is 0.
 
     The slope is (d numerator - quotient d denominator) / denominator: the square of a small denominator, by which the
@@ -57,7 +63,12 @@ def _quotient_jvp(primals, tangents):
     return quotient, (tangents[0] - quotient * tangents[1]) / primals[1]
 
 
-def masked_mean(x, mask):
+def added(arrays: Iterable[jax.Array]) -> jax.Array:
+    """The sum of one array or more of one shape."""
+    return functools.reduce(operator.add, arrays)
+
+
+def masked_mean(x: Array, mask: Array) -> jax.Array:
     """Mean of x where mask is 1; exactly 0, with a 0 gradient, when mask is empty.
 
     Args:
@@ -69,11 +80,11 @@ def masked_mean(x, mask):
     return jnp.sum(jnp.where(mask > 0, x, 0) * mask) / jnp.where(count > 0, count, 1)
 
 
-def matvec(matrix, vector):
+def matvec(matrix: Array, vector: Array) -> jax.Array:
     """(..., i, j) x (..., j) -> (..., i) in true float32, on GPUs and TPUs too."""
     return jnp.einsum("...ij,...j->...i", matrix, vector, precision=HIGHEST)
 
 
-def matmul(a, b):
+def matmul(a: Array, b: Array) -> jax.Array:
     """(..., i, j) x (..., j, k) -> (..., i, k) in true float32, on GPUs and TPUs too."""
     return jnp.matmul(a, b, precision=HIGHEST)

@@ -7,13 +7,13 @@ stored  what a file holds of a part: {"part": its class's name, and its fields};
 import dataclasses
 import typing
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any
+
+from zestjax.base.types import T
 
 MOST_NUMBER = 2**16  # of a stored integer: planes, channels or pixels; a larger one is damage
 MOST_ENTRIES = 256  # of a stored list, for the same reason
 MOST_DEPTH = 16  # of parts within parts
-
-T = TypeVar("T")
 
 
 @typing.dataclass_transform(frozen_default=True)

@@ -10,12 +10,13 @@ its own parameters in float32 and casts them inside the step: gradients and mome
 import jax.numpy as jnp
 
 from zestjax.base.trees import tree_cast
+from zestjax.base.types import T
 
 NETWORK = {"float32": jnp.float32, "bfloat16": jnp.bfloat16, "float64": jnp.float64}
 PRECISIONS = tuple(NETWORK)
 
 
-def network_at(precision, params):
+def network_at(precision: str, params: T) -> T:
     """Parameters as a network of that precision holds them.
 
     Raises:
@@ -28,6 +29,6 @@ def network_at(precision, params):
     return tree_cast(params, NETWORK[precision])
 
 
-def geometry_at(precision, data):
+def geometry_at(precision: str, data: T) -> T:
     """Data (cameras, images, maps) as the geometry beside a network of that precision computes with them."""
     return tree_cast(data, jnp.float64 if precision == "float64" else jnp.float32)

@@ -6,15 +6,14 @@ gap      how far a view's own surface lies in front of the point, in its toleran
          about 0 it is that surface, < 0 the view looks through it
 """
 
-import functools
-import operator
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
-from zestjax.base.numerics import safe_divide
+from zestjax.base.numerics import added, safe_divide
+from zestjax.base.types import Array
 from zestjax.cameras import Camera, project
 from zestjax.resample import bilinear_cells, corner_offsets, gather_corners, interpolate
 
@@ -25,10 +24,10 @@ class SourceViews(NamedTuple):
     """tables: (V, H, W, C): colour, then, of trusted views, probability of moving, inverse depth, its tolerance.
     cameras: `Camera` (V, ...). valid: (V,) 1 or 0. times: (V,) frame time minus target time, frames."""
 
-    tables: jax.Array
+    tables: Array
     cameras: Camera
-    valid: jax.Array
-    times: jax.Array
+    valid: Array
+    times: Array
 
 
 class ViewSamples(NamedTuple):
@@ -41,7 +40,7 @@ class ViewSamples(NamedTuple):
     gap: jax.Array
 
 
-def sample_views(views, points):
+def sample_views(views: SourceViews, points: jax.Array) -> ViewSamples:
     """Every view's colour and trust maps where the points project to.
 
     Four gathers of whole rows for all views at once, from one flat table.
@@ -74,17 +73,17 @@ def sample_views(views, points):
     return ViewSamples(values[:, :3], visible, values[:, 3], jnp.where(seen, gap, 0))
 
 
-def hidden(gap):
+def hidden(gap: jax.Array) -> jax.Array:
     """Soft probability that a point at `gap` is hidden behind a view's surface, in [0, 1]."""
     return -jnp.expm1(-jnp.square(jnp.maximum(gap, 0)))
 
 
-def on_surface(gap):
+def on_surface(gap: jax.Array) -> jax.Array:
     """Soft probability that a point at `gap` is the view's surface, in [0, 1]; `trust.agreement` of a gap."""
     return jnp.exp(-jnp.square(gap))
 
 
-def over_views(weights, values):
+def over_views(weights: jax.Array, values: jax.Array) -> jax.Array:
     """Weighted mean over views: (V, P), (V, C, P) -> (C, P); 0 where all weights are 0.
 
     Written as a sum of products: sums over a leading axis are slow on a CPU.
@@ -99,12 +98,7 @@ def over_views(weights, values):
     return jax.lax.optimization_barrier(safe_divide(summed, total[None]))
 
 
-def added(arrays):
-    """The sum of one array or more of one shape."""
-    return functools.reduce(operator.add, arrays)
-
-
-def parallax(cameras, points, points_beyond):
+def parallax(cameras: Camera, points: jax.Array, points_beyond: jax.Array) -> jax.Array:
     """(V, P) pixels by which the views see two points of each target ray apart: 0 from the target's own position."""
     cameras = jax.tree.map(lambda x: x[:, None], cameras)
     here, beyond = project(cameras, points), project(cameras, points_beyond)

@@ -4,13 +4,14 @@ P  points   V  slots (neighbours of the time)   C  channels of the motion volume
 flow  offsets in coordinates of the target's frustum, forward (t + 1) and backward (t - 1)
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from zestjax.fields.conditioning import ViewSamples, on_surface, over_views
 from zestjax.fields.conditioning import hidden as hidden_behind
-from zestjax.fields.conditioning import on_surface, over_views
 from zestjax.fields.heads import HeadParams, Reading, ViewFeatures
 from zestjax.fields.trunk import Trunk, init_trunk, trunk
 from zestjax.nets.layers import Dense, dense, init_dense, raised
@@ -48,7 +49,17 @@ class DynamicSample(NamedTuple):
     confidence_backward: jax.Array
 
 
-def init_dynamic(key, *, n_point, n_condition, n_volume, width, depth, head, looks):
+def init_dynamic(
+    key: jax.Array,
+    *,
+    n_point: int,
+    n_condition: int,
+    n_volume: int,
+    width: int,
+    depth: int,
+    head: Callable[[jax.Array], HeadParams],
+    looks: bool,
+) -> DynamicParams:
     """Parameters, as `static.init_static`. n_volume: channels of the volume. looks: the head looks at each view: an
     early flow says where, and the field has a say in the blend."""
     keys = jax.random.split(key, 8)
@@ -61,17 +72,18 @@ def init_dynamic(key, *, n_point, n_condition, n_volume, width, depth, head, loo
     )  # fmt: skip
 
 
-def early_flow(params, point, volume, *, reach):
+def early_flow(params: DynamicParams, point: jax.Array, volume: jax.Array, *, reach: float) -> jax.Array:
     """(P, 6) flow forward then backward, from the motion volume alone, within +-reach of the frustum.
 
     It says where to look in the neighbours before their colours are read (flow-compensated aggregation).
     """
+    assert params.early is not None  # the head looks
     first, second = params.early
     state = jax.nn.relu(dense(first, jnp.concatenate([volume, point], axis=-1)))
     return reach * jnp.tanh(raised(dense(second, state)))
 
 
-def dynamic_views(samples, times):
+def dynamic_views(samples: ViewSamples, times: jax.Array) -> ViewFeatures:
     """`ViewFeatures` of `sample_views` for what moves: seen moving, at its own depth, in its slot."""
     agree, behind = on_surface(samples.gap), hidden_behind(samples.gap)
     support = samples.visible * samples.moving * agree
@@ -90,7 +102,14 @@ def dynamic_views(samples, times):
 
 
 def dynamic_field(
-    params: DynamicParams, point, direction, reading: Reading, *, reach=1.0, early=None, modulation="multiply"
+    params: DynamicParams,
+    point: jax.Array,
+    direction: jax.Array,
+    reading: Reading,
+    *,
+    reach: float = 1.0,
+    early: jax.Array | None = None,
+    modulation: str = "multiply",
 ) -> DynamicSample:
     """Density, colour, flow and confidence of P points at one time.
 

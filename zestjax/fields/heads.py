@@ -75,11 +75,11 @@ class Blend:
 
     looks: ClassVar[bool] = True
 
-    def channels(self, *, volume, views, summaries):
+    def channels(self, *, volume: int, views: int, summaries: int) -> int:
         """See `Head`."""
         return volume + POOLED + summaries
 
-    def init(self, key, *, features, width, directions):
+    def init(self, key: jax.Array, *, features: int, width: int, directions: int) -> HeadParams:
         """See `Head`."""
         colour, views = jax.random.split(key)
         return HeadParams(
@@ -106,11 +106,11 @@ class Direct:
 
     looks: ClassVar[bool] = False
 
-    def channels(self, *, volume, views, summaries):
+    def channels(self, *, volume: int, views: int, summaries: int) -> int:
         """See `Head`."""
         return max(volume + 4 * views, 1)
 
-    def init(self, key, *, features, width, directions):
+    def init(self, key: jax.Array, *, features: int, width: int, directions: int) -> HeadParams:
         """See `Head`."""
         return HeadParams(init_colour_head(key, width, directions), None)
 
@@ -120,7 +120,7 @@ class Direct:
         return Reading(concatenated(volume, samples), colour)
 
 
-def concatenated(volume, samples):
+def concatenated(volume: jax.Array, samples: ViewSamples | None) -> jax.Array:
     """(P, C + 4 V): volume features, then every view's colour and visibility bit, as the paper conditions."""
     if samples is None:
         return volume if volume.shape[-1] else jnp.ones((volume.shape[0], 1), volume.dtype)

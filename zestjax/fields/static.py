@@ -3,12 +3,14 @@
 P  points   V  key-frames   C  channels of the geometry volume   Q  encoded direction
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from zestjax.fields.conditioning import added, on_surface, over_views
+from zestjax.base.numerics import added
+from zestjax.fields.conditioning import ViewSamples, on_surface, over_views
 from zestjax.fields.conditioning import hidden as hidden_behind
 from zestjax.fields.heads import HeadParams, Reading, ViewFeatures
 from zestjax.fields.trunk import Trunk, init_trunk, trunk
@@ -36,7 +38,9 @@ class StaticSample(NamedTuple):
     blend_logit: jax.Array
 
 
-def init_static(key, *, n_point, n_condition, width, depth, head):
+def init_static(
+    key: jax.Array, *, n_point: int, n_condition: int, width: int, depth: int, head: Callable[[jax.Array], HeadParams]
+) -> StaticParams:
     """Parameters. n_condition: what the head reads of a point. head: key -> its parameters."""
     keys = jax.random.split(key, 4)
     blend = init_dense(keys[2], width, 1, scale=0.1)
@@ -48,7 +52,7 @@ def init_static(key, *, n_point, n_condition, width, depth, head):
     )
 
 
-def static_views(samples, shift, times):
+def static_views(samples: ViewSamples, shift: jax.Array, times: jax.Array) -> ViewFeatures:
     """Per-view features of `sample_views` for the static scene.
 
     Args:
@@ -80,7 +84,9 @@ def static_views(samples, shift, times):
     return jax.lax.stop_gradient(ViewFeatures(features, weights, summary))
 
 
-def static_field(params: StaticParams, point, direction, reading: Reading, *, modulation="multiply") -> StaticSample:
+def static_field(
+    params: StaticParams, point: jax.Array, direction: jax.Array, reading: Reading, *, modulation: str = "multiply"
+) -> StaticSample:
     """Density, colour and blend of P points.
 
     Args:

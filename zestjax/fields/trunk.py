@@ -3,13 +3,14 @@
 P  points   F  conditioning features   Q  encoded direction   V  source views   U  channels per view
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_option
-from zestjax.fields.conditioning import added
+from zestjax.base.numerics import added
 from zestjax.nets.layers import Dense, dense, init_dense, lowered, raised
 
 MODULATIONS = ("multiply", "add")
@@ -39,7 +40,7 @@ class ColourHead(NamedTuple):
     colour: Dense
 
 
-def init_trunk(key, n_in, n_condition, *, width, depth):
+def init_trunk(key: jax.Array, n_in: int, n_condition: int, *, width: int, depth: int) -> Trunk:
     """A trunk of `depth` layers; from six layers on, the input is joined again after the fifth, as in NeRF."""
     keys = jax.random.split(key, depth + 1)
     skip = 5 if depth > 5 else -1
@@ -49,7 +50,7 @@ def init_trunk(key, n_in, n_condition, *, width, depth):
     return Trunk(layers, condition._replace(bias=jnp.ones_like(condition.bias)))
 
 
-def trunk(params, x, condition, *, modulation="multiply"):
+def trunk(params: Trunk, x: jax.Array, condition: jax.Array, *, modulation: str = "multiply") -> jax.Array:
     """Hidden state of each point: relu(layer(h) * condition), layer by layer.
 
     Args:
@@ -75,7 +76,7 @@ def trunk(params, x, condition, *, modulation="multiply"):
     return hidden
 
 
-def init_view_head(key, n_view, n_hidden, *, width=16):
+def init_view_head(key: jax.Array, n_view: int, n_hidden: int, *, width: int = 16) -> ViewHead:
     """Parameters of the per-view network."""
     lift, query, score = jax.random.split(key, 3)
     return ViewHead(
@@ -83,7 +84,7 @@ def init_view_head(key, n_view, n_hidden, *, width=16):
     )
 
 
-def lifted(params, features):
+def lifted(params: ViewHead, features: jax.Array) -> list[jax.Array]:
     """(V, U, P) -> V arrays (width, P) before any activation.
 
     One product per view, the bias as one more row: the gradients are products too, not slow sums.
@@ -94,7 +95,7 @@ def lifted(params, features):
     return [kernel @ jnp.concatenate([view, ones]) for view in features]
 
 
-def pooled_views(lift, weights):
+def pooled_views(lift: Sequence[jax.Array], weights: jax.Array) -> jax.Array:
     """(P, width) weighted mean over views of their activated features; weights (V, P), every view at least a little."""
     weights = weights + 1e-3
     total = added(weights[v] for v in range(len(lift)))
@@ -103,7 +104,7 @@ def pooled_views(lift, weights):
     return raised(added(share[v][None] * jax.nn.relu(view) for v, view in enumerate(lift)).T)
 
 
-def view_scores(params, lift, hidden):
+def view_scores(params: ViewHead, lift: Sequence[jax.Array], hidden: jax.Array) -> jax.Array:
     """(V, P) logits with which each view's colour is chosen.
 
     Args:
@@ -116,7 +117,7 @@ def view_scores(params, lift, hidden):
     return raised(jnp.concatenate([kernel @ jax.nn.relu(view + query) for view in lift]) + params.score.bias[0])
 
 
-def blend_of_views(scores, prior, visible, colour):
+def blend_of_views(scores: jax.Array, prior: jax.Array, visible: jax.Array, colour: jax.Array) -> jax.Array:
     """Softmax over the views that see a point of their colours.
 
     Args:
@@ -136,7 +137,7 @@ def blend_of_views(scores, prior, visible, colour):
     return (mean / jnp.maximum(total, 1e-9)[None]).T
 
 
-def init_colour_head(key, n_hidden, n_view):
+def init_colour_head(key: jax.Array, n_hidden: int, n_view: int) -> ColourHead:
     """The paper's head: a linear map, then direction joined, half the width, three channels."""
     a, b, c = jax.random.split(key, 3)
     return ColourHead(
@@ -146,7 +147,7 @@ def init_colour_head(key, n_hidden, n_view):
     )
 
 
-def direct_colour(params, hidden, direction):
+def direct_colour(params: ColourHead, hidden: jax.Array, direction: jax.Array) -> jax.Array:
     """(P, 3) in (0, 1) from the state and the encoded direction."""
     features = dense(params.feature, hidden)
     features = jnp.concatenate([features, lowered(direction, params.feature.kernel)], axis=-1)

@@ -9,6 +9,7 @@ coordinate  plane coordinate in [0, 1], linear in inverse depth: 0 at the near b
 import functools
 import math
 import operator
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 
 from zestjax.base.checks import check_counts
 from zestjax.base.parts import part
+from zestjax.base.types import Array
 from zestjax.frames.evidence import FLOW_CHANNELS, Evidence
 from zestjax.nets.layers import raised
 from zestjax.nets.unet2d import UNet2d, init_unet2d, unet2d
@@ -54,7 +56,7 @@ class FrameMaps(NamedTuple):
     moving_logits: jax.Array
 
 
-def init_analysis(key, *, planes, widths):
+def init_analysis(key: jax.Array, *, planes: int, widths: Sequence[int]) -> AnalysisParams:
     """Parameters for E planes; `widths` are the U-Net's."""
     n_in = 4 * planes + SUMMARIES + FLOW_CHANNELS + 2 + 12
     net = init_unet2d(key, n_in, widths, 2 * planes + COSTS + 2 + MOVING_PARTS)
@@ -132,7 +134,7 @@ def _channels(evidence, costs, ground, still):
     return jnp.concatenate([*parts, 8 * evidence.flow - 4, 2 * evidence.sure - 1, 2 * evidence.colours - 1], -1)
 
 
-def frame_maps(params, evidence, *, still=False):
+def frame_maps(params: AnalysisParams, evidence: Evidence, *, still: bool = False) -> FrameMaps:
     """Depth and moving pixels of each frame from its evidence.
 
     A cell's surface stands still or moves, with the probability of its mask; either way it has a distribution over
@@ -179,7 +181,7 @@ def _mixed(standing, moved, moving):
     return jnp.logaddexp(log(standing, -moving), log(moved, moving))
 
 
-def plane_moments(logits, *, reach=2):
+def plane_moments(logits: Array, *, reach: int = 2) -> tuple[jax.Array, jax.Array]:
     """Sub-plane coordinate of the mode of a distribution over planes, and its spread.
 
     The mean is taken within `reach` planes of the mode: the mean of two surfaces is on neither.

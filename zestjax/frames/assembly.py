@@ -5,6 +5,7 @@ exclude  frames that must serve nothing: not as key-frame or slot, not in anothe
 """
 
 import functools
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import jax
@@ -12,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax.base.checks import traced
+from zestjax.base.types import Array, Scalar
+from zestjax.cameras import Camera
 from zestjax.frames.cells import half_images
 from zestjax.frames.evidence import Evidence, Neighbours, Sources, frame_evidence
 from zestjax.frames.optical_flow import VideoFlow, video_flow
@@ -20,14 +23,14 @@ from zestjax.frames.selection import Chosen, key_frames, slots
 EVIDENCE_SOURCES = 8
 
 
-def positions(cameras):
+def positions(cameras: Camera) -> Array:
     """(N, 3) optical centres: numpy of cameras on the host, JAX's where they are traced."""
     xp = jnp if traced(cameras) else np
     pose = xp.asarray(cameras.camera_from_world)
     return -xp.einsum("nji,nj->ni", pose[:, :3, :3], pose[:, :3, 3])
 
 
-def taken(cameras, frames):
+def taken(cameras: Camera, frames: int | Array) -> Camera:
     """`Camera` of the chosen frames."""
     xp = jnp if traced((cameras, frames)) else np
     return jax.tree.map(lambda leaf: xp.asarray(leaf)[frames], cameras)
@@ -40,7 +43,7 @@ class Footage(NamedTuple):
     flow: VideoFlow
 
 
-def footage(images):
+def footage(images: Array) -> Footage:
     """`Footage` of (N, H, W, 3) images, uint8 or float in [0, 1]."""
     return Footage(_halved(jnp.asarray(images)), video_flow(images))
 
@@ -50,7 +53,7 @@ def _halved(images):
     return half_images(colours_of(images))
 
 
-def colours_of(images):
+def colours_of(images: Array) -> Array:
     """Images as they are, or of uint8 their float32 in [0, 1]."""
     return images.astype(jnp.float32) / 255 if images.dtype == jnp.uint8 else images
 
@@ -61,7 +64,16 @@ def _evidence(image, camera, sources, neighbours, near, far, *, planes):
     return Evidence(*(jnp.round(255 * jnp.clip(x, 0, 1)).astype(jnp.uint8) for x in found))
 
 
-def video_evidence(footage, cameras, near, far, *, planes, frames=None, exclude=()):
+def video_evidence(
+    footage: Footage,
+    cameras: Camera,
+    near: Scalar,
+    far: Scalar,
+    *,
+    planes: int,
+    frames: Sequence[int] | Array | None = None,
+    exclude: Collection[int] = (),
+) -> Evidence:
     """`Evidence` of frames of a video, quantised to uint8 (1/255 of the truncation), on the host.
 
     Args:
@@ -97,7 +109,7 @@ def _compared(places, frame, exclude):
     return chosen, slots(len(places), frame, offsets=(1, -1), exclude=others)
 
 
-def dequantised(evidence):
+def dequantised(evidence: Evidence) -> Evidence:
     """uint8 `Evidence` as float32 in [0, 1].
 
     A product: compiled, a division by a constant becomes one too, and would round otherwise than uncompiled.

@@ -5,19 +5,23 @@ h w      cells that cover it; cell j covers the pixels 4 j to 4 j + 3, and is ce
 half     half-resolution maps, made even: two rows and two columns of them to a cell
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
+
+from zestjax.base.types import Array
 
 SIDE = 4  # pixels to a cell
 CENTRE = (SIDE - 1) / 2  # of cell 0, pixels
 
 
-def cells_of(size):
+def cells_of(size: int) -> int:
     """Cells that cover `size` pixels: half-resolution pixels, made even, in pairs."""
     return (size + SIDE - 1) // SIDE
 
 
-def pooled(x, factor):
+def pooled(x: Array, factor: int) -> jax.Array:
     """Mean over factor x factor blocks of (..., H, W, C); the remainder at the right and bottom repeats the edge."""
     height, width, channels = x.shape[-3:]
     lead = [(0, 0)] * (x.ndim - 3)
@@ -27,27 +31,27 @@ def pooled(x, factor):
     return x.mean(axis=(-4, -2))
 
 
-def cell_values(half):
+def cell_values(half: Array) -> jax.Array:
     """Half-resolution maps (..., 2h, 2w, C) as the four values of each cell, (..., h, w, 4 C)."""
     *lead, height, width, channels = half.shape
     x = half.reshape(*lead, height // 2, 2, width // 2, 2, channels)
     return jnp.moveaxis(x, -4, -3).reshape(*lead, height // 2, width // 2, 4 * channels)
 
 
-def half_images(images):
+def half_images(images: Array) -> jax.Array:
     """Images (..., H, W, 3) at half resolution with even sizes, so that cells are whole."""
     half = pooled(images, 2)
     lead = [(0, 0)] * (half.ndim - 3)
     return jnp.pad(half, [*lead, (0, half.shape[-3] % 2), (0, half.shape[-2] % 2), (0, 0)], mode="edge")
 
 
-def grown(x, size, *, factor):
+def grown(x: Array, size: Sequence[int], *, factor: int) -> jax.Array:
     """(V, h, w) maps to image size (H, W): linear between the centres of what is `factor` pixels wide."""
     wide = jax.image.resize(x, (x.shape[0], factor * x.shape[1], factor * x.shape[2]), "linear")
     return wide[:, : size[0], : size[1]]
 
 
-def nearest_cells(maps, pixels):
+def nearest_cells(maps: Array, pixels: Array) -> jax.Array:
     """What the four cells about a pixel hold, and their blend.
 
     Args:

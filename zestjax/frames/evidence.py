@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from zestjax.base.checks import check_shapes
 from zestjax.base.numerics import matvec, safe_norm
+from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera, resized
 from zestjax.frames.cells import cell_values, pooled
 from zestjax.planesweep import homographies, plane_depths
@@ -40,29 +40,29 @@ class Evidence(NamedTuple):
     colours: (h, w, 12) the frame's colours at the four half-resolution pixels of the cell.
     """
 
-    static: jax.Array
-    best: jax.Array
-    still: jax.Array
-    moving: jax.Array
-    flow: jax.Array
-    sure: jax.Array
-    colours: jax.Array
+    static: Array
+    best: Array
+    still: Array
+    moving: Array
+    flow: Array
+    sure: Array
+    colours: Array
 
 
 class Sources(NamedTuple):
     """Frames to compare with: half-resolution images (J, 2h, 2w, 3), `Camera` of full size (J, ...), valid (J,)."""
 
-    images: jax.Array
+    images: Array
     cameras: Camera
-    valid: jax.Array | np.ndarray
+    valid: Array
 
 
 class Neighbours(NamedTuple):
     """How the frame's pixels move to its neighbours. flow: (2, 2h, 2w, 2) image pixels. sure: (2, 2h, 2w) in [0, 1],
     0 where there is no such frame. cameras: `Camera` of full size (2, ...)."""
 
-    flow: jax.Array | np.ndarray
-    sure: jax.Array | np.ndarray
+    flow: Array
+    sure: Array
     cameras: Camera
 
 
@@ -78,7 +78,7 @@ def _carried(homography, grid):
     return points[..., :2] / jnp.where(front, points[..., 2], 1)[..., None], front
 
 
-def static_costs(reference, sources, hom):
+def static_costs(reference: Array, sources: Sources, hom: Array) -> tuple[jax.Array, jax.Array]:
     """(h, w) mean cost over the valid sources at one plane, and over their better half; hom (J, 3, 3) between
     half-resolution pixels of the reference (2h, 2w, 3) and the sources."""
     grid = _grid(reference.shape[0], reference.shape[1], reference.dtype)
@@ -111,7 +111,7 @@ def _ascending(arrays):
     return arrays
 
 
-def flow_gaps(flow, sure, hom):
+def flow_gaps(flow: Array, sure: Array, hom: Array) -> tuple[jax.Array, jax.Array]:
     """(h, w) gaps at one plane if a cell stands still there, and if it moves with constant velocity.
 
     Args:
@@ -145,7 +145,9 @@ def _flow_channels(neighbours, hom):
     return cell_values(jnp.concatenate(parts, -1))
 
 
-def frame_evidence(image, camera, sources, neighbours, near, far, *, planes):
+def frame_evidence(
+    image: Array, camera: Camera, sources: Sources, neighbours: Neighbours, near: Scalar, far: Scalar, *, planes: int
+) -> Evidence:
     """Evidence of one frame.
 
     Args:

@@ -6,13 +6,13 @@ blind    said of a camera that sees nothing of what the others see between near 
 reading  another convention that a pose may have been written in
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zestjax.base.checks import check_known, check_shapes, check_types, traced
 from zestjax.cameras import Camera, check_camera
-from zestjax.video import check_video
+from zestjax.video import Video, check_video
 
 ROUNDING = 1e-9  # a gap between two views, as a share of their extent, that float64 may have made
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -38,7 +38,7 @@ class Sight(NamedTuple):
     corners: np.ndarray
 
 
-def check_inputs(where, video, *, quantised=False):
+def check_inputs(where: str, video: Video, *, quantised: bool = False) -> Video:
     """Refuse a video that no view can be predicted from; see also `zestjax.video.check_video`.
 
     Args:
@@ -65,7 +65,7 @@ def check_inputs(where, video, *, quantised=False):
     return video
 
 
-def check_target(where, video, camera):
+def check_target(where: str, video: Video, camera: Camera) -> None:
     """Refuse a target camera that cannot be used, or that sees nothing of what the input cameras see.
 
     Args:
@@ -87,7 +87,9 @@ def check_target(where, video, camera):
         )
 
 
-def check_view(where, video, camera, time, *, exclude=()):
+def check_view(
+    where: str, video: Video, camera: Camera, time: Any, *, exclude: Any = ()
+) -> tuple[Any, tuple[int, ...]]:
     """Refuse a view that a video cannot give.
 
     Args:
@@ -120,7 +122,7 @@ def check_view(where, video, camera, time, *, exclude=()):
     return time if traced(time) else int(time), exclude
 
 
-def check_one_camera(where, camera):
+def check_one_camera(where: str, camera: Any) -> None:
     """Refuse what is not one `Camera`; its values need not be known.
 
     Raises:
@@ -134,7 +136,7 @@ def check_one_camera(where, camera):
     check_shapes(where, intrinsics=(camera.intrinsics, "3 3"), camera_from_world=(camera.camera_from_world, "4 4"))
 
 
-def check_exclude(where, count, exclude):
+def check_exclude(where: str, count: int, exclude: Any) -> tuple[int, ...]:
     """Refuse frames to exclude that a video of `count` frames does not have, or all of them.
 
     Returns:

@@ -34,7 +34,15 @@ class KnownFrames(NamedTuple):
     flow_valid: np.ndarray | None = None
 
 
-def known_frames(video: Video, *, moving=None, mined=None, disparity=None, flow=None, flow_valid=None) -> KnownFrames:
+def known_frames(
+    video: Video,
+    *,
+    moving: np.ndarray | None = None,
+    mined: np.ndarray | None = None,
+    disparity: np.ndarray | None = None,
+    flow: np.ndarray | None = None,
+    flow_valid: np.ndarray | None = None,
+) -> KnownFrames:
     """`KnownFrames` of a video on the host, and of what else is known; see there.
 
     Raises:

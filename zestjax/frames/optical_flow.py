@@ -10,6 +10,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from zestjax.base.types import Array
+
 LEAST_SIDE = 16  # pixels; smaller images are enlarged for the search
 
 
@@ -21,7 +23,7 @@ class VideoFlow(NamedTuple):
     sure: np.ndarray
 
 
-def video_flow(images):
+def video_flow(images: Array) -> VideoFlow:
     """Optical flow from every frame to its two neighbours in time.
 
     Args:

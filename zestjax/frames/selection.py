@@ -5,6 +5,7 @@ positions  (N, 3) optical centres, world units
 valid      1.0 where the slot holds a frame, 0.0 where the video has none
 """
 
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 
 from zestjax.base.checks import check_counts, check_option, traced
 from zestjax.base.parts import part
+from zestjax.base.types import Array
 from zestjax.video import Frames, Inputs
 
 RANKS = (0, 1, 2, 3, 4, 6, 8, 11)
@@ -23,8 +25,8 @@ MOST_FRAMES = 64  # that serve one target: a file of weights may not ask for mor
 class Chosen(NamedTuple):
     """frames: (K,) int indices into the video; an empty slot repeats a real frame. valid: (K,) float32."""
 
-    frames: np.ndarray | jax.Array
-    valid: np.ndarray | jax.Array
+    frames: Array
+    valid: Array
 
 
 def _filled(frames, count):
@@ -40,7 +42,15 @@ def _spread_ranks(count, available):
     return sorted(ranks[:count])
 
 
-def key_frames(positions, count, *, target=None, time=0, choice="nearest", exclude=()):
+def key_frames(
+    positions: Array,
+    count: int,
+    *,
+    target: Array | None = None,
+    time: int | Array = 0,
+    choice: str = "nearest",
+    exclude: Collection[int] = (),
+) -> Chosen:
     """The key-frames of a target.
 
     Source: ZeST-NeRF section 3.1 (`spread`).
@@ -79,7 +89,7 @@ def key_frames(positions, count, *, target=None, time=0, choice="nearest", exclu
     return _filled(usable[order][ranks], count)
 
 
-def slots(frames, time, *, offsets, exclude=()):
+def slots(frames: int, time: int | Array, *, offsets: Sequence[int], exclude: Collection[int] = ()) -> Chosen:
     """The neighbours of a time: frames time + offsets, each with a validity bit.
 
     Source: ZeST-NeRF section 3.1 (M neighbours of the target frame).
@@ -113,7 +123,7 @@ class KeyFrames:
         check_counts("KeyFrames", count=(self.count, 1, MOST_FRAMES), least=(self.least, 1, self.count))
         check_option("KeyFrames", choice=(self.choice, CHOICES))
 
-    def choose(self, positions, *, target, time, exclude=()) -> Chosen:
+    def choose(self, positions: Array, *, target: Array, time: int | Array, exclude: Collection[int] = ()) -> Chosen:
         """Which frames of a video serve a target."""
         if (left := len(set(range(len(positions))) - set(exclude))) < self.least:
             raise ValueError(f"KeyFrames: a view needs {self.least} source frames, {left} are left; give more frames.")
@@ -140,7 +150,7 @@ class Slots:
         """How many."""
         return len(self.offsets)
 
-    def choose(self, positions, *, time, exclude=()) -> Chosen:
+    def choose(self, positions: Array, *, time: int | Array, exclude: Collection[int] = ()) -> Chosen:
         """Which frames of a video serve a target."""
         return slots(len(positions), time, offsets=self.offsets, exclude=exclude)
 

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
-from zestjax.cameras import project
+from zestjax.base.types import Array
+from zestjax.cameras import Camera, project
 from zestjax.resample import bilinear
 
 FARTHEST = 10  # tolerances: beyond, exp(-x^2) is 0 in float32, while x^2 and d x / d tolerance may overflow
@@ -25,18 +26,18 @@ class Trust(NamedTuple):
     """Maps of each input frame, at one resolution. static: (..., H, W) in [0, 1]. inverse_depth: (..., H, W), >= 0.
     tolerance: (..., H, W), > 0, of the inverse depth."""
 
-    static: jax.Array
-    inverse_depth: jax.Array
-    tolerance: jax.Array
+    static: Array
+    inverse_depth: Array
+    tolerance: Array
 
 
-def agreement(inverse_depth, tolerance, point_inverse_depth):
+def agreement(inverse_depth: Array, tolerance: Array, point_inverse_depth: Array) -> jax.Array:
     """exp(-((inverse_depth - point) / tolerance)^2), in [0, 1]: is the point on the surface that the frame shows?"""
     gap = _gap(jnp.abs(inverse_depth - point_inverse_depth), tolerance)
     return jnp.exp(-gap * gap)
 
 
-def trusted(static, inverse_depth, tolerance, point_inverse_depth):
+def trusted(static: Array, inverse_depth: Array, tolerance: Array, point_inverse_depth: Array) -> Array:
     """Weight in [0, 1] of a source at a point: static and not hidden.
 
     static * exp(-(relu(inverse_depth - point) / tolerance)^2); the arguments are arrays of one shape, see the header.
@@ -50,7 +51,7 @@ def trusted(static, inverse_depth, tolerance, point_inverse_depth):
     return static * jnp.exp(-gap * gap)
 
 
-def trusted_at(trust, camera, points):
+def trusted_at(trust: Trust, camera: Camera, points: Array) -> jax.Array:
     """Weight of one source view at world points: `trusted`, with the maps read where the points project to.
 
     Args:

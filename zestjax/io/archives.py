@@ -10,6 +10,7 @@ import tarfile
 import zlib
 from pathlib import Path
 
+from zestjax.base.types import FilePath
 from zestjax.io.reading import open_regular
 
 GZIP = b"\x1f\x8b"  # how every gzip file begins
@@ -23,7 +24,7 @@ class ArchiveError(ValueError):
     """Not an archive, a damaged one, or one without the file that was asked for. Names the archive."""
 
 
-def is_gzip(path):
+def is_gzip(path: FilePath) -> bool:
     """Whether a file begins as a gzip file does; False for what is no regular file.
 
     Raises:
@@ -36,7 +37,7 @@ def is_gzip(path):
         return file.read(len(GZIP)) == GZIP
 
 
-def read_member(path, name, *, most, most_unpacked):
+def read_member(path: FilePath, name: str, *, most: int, most_unpacked: int) -> bytes:
     """The content of one member. What follows it in the archive is not read.
 
     Args:

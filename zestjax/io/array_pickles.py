@@ -9,6 +9,7 @@ instruction   one step of a pickle: it puts a value on a stack, or makes one of 
 
 import enum
 import pickletools
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,7 @@ class ArrayPickleError(ValueError):
     """Not a pickle, a damaged one, or one that holds more than arrays in dicts."""
 
 
-def read_array_pickle(content):
+def read_array_pickle(content: bytes) -> dict[str, Any]:
     """Dicts of float32 arrays, as they were pickled in protocol 3.
 
     Args:

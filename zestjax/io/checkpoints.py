@@ -6,9 +6,11 @@ step     how many steps the tree has seen; it is in the file's name
 
 import re
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from zestjax.base.types import FilePath, Tree
 from zestjax.io.weights import DamagedFileError, UnreadableFileError, WeightsError, load_weights, save_weights
 
 _NAME = re.compile(r"step_(\d{9,})\.safetensors")
@@ -28,7 +30,7 @@ class Checkpoint(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def save_checkpoint(folder, step, tree, metadata, *, keep=2):
+def save_checkpoint(folder: FilePath, step: int, tree: Tree, metadata: Mapping[str, Any], *, keep: int = 2) -> Path:
     """Write `step_<step>.safetensors`, then remove all but the newest `keep` checkpoints.
 
     Older ones go only after the new one is complete on the disk: a full disk costs the new one alone.
@@ -59,7 +61,7 @@ def save_checkpoint(folder, step, tree, metadata, *, keep=2):
     return path
 
 
-def latest_checkpoint(folder, like):
+def latest_checkpoint(folder: FilePath, like: Tree) -> Checkpoint | None:
     """The newest checkpoint that is whole, or None when the folder holds none.
 
     Args:

@@ -14,7 +14,7 @@ TIFF_SIZES = {257: 0, 256: 1, 323: 0, 322: 1}  # tag -> axis: of the picture, an
 TIFF_TYPES = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "q"}  # of whole numbers
 
 
-def claimed_size(content):
+def claimed_size(content: bytes) -> tuple[int, ...] | None:
     """The claim of a picture's bytes; None where they are of another format, or end before it."""
     read = next((read for mark, read in FORMATS.items() if content.startswith(mark)), None)
     try:
@@ -23,7 +23,7 @@ def claimed_size(content):
         return None
 
 
-def most_pixels(content):
+def most_pixels(content: bytes) -> int | None:
     """Most pixels that these bytes can hold, where the format bounds them by its length; else None."""
     if not content.startswith(PNG) or len(content) < 26:
         return None

@@ -4,16 +4,18 @@ picture  (H, W, 3) RGB, float in [0, 1] or uint8
 """
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import matplotlib
 import numpy as np
 
 from zestjax.base.checks import check_shapes
+from zestjax.base.types import Array
 from zestjax.io.pictures import to_bytes
 
 
-def depth_picture(depth, *, near, far):
+def depth_picture(depth: Array, *, near: float, far: float) -> np.ndarray:
     """(H, W) depths, world units, as a picture: even in inverse depth, near bright, not finite or <= 0 black.
 
     Raises:
@@ -26,7 +28,7 @@ def depth_picture(depth, *, near, far):
     return np.where(known[..., None], _coloured("turbo", level), 0).astype(np.float32)
 
 
-def share_picture(share):
+def share_picture(share: Array) -> np.ndarray:
     """(H, W) values in [0, 1], such as the dynamicness, as a picture: black to bright yellow.
 
     Raises:
@@ -36,7 +38,7 @@ def share_picture(share):
     return _coloured("inferno", np.asarray(share))
 
 
-def error_picture(picture, truth, *, most=0.25):
+def error_picture(picture: Array, truth: Array, *, most: float = 0.25) -> np.ndarray:
     """Absolute differences of two float pictures, mean over the channels; `most` and above is brightest.
 
     Raises:
@@ -46,7 +48,9 @@ def error_picture(picture, truth, *, most=0.25):
     return share_picture(np.abs(np.asarray(picture) - np.asarray(truth)).mean(-1) / most)
 
 
-def side_by_side(pictures, *, labels=None, columns=None, gap=4):
+def side_by_side(
+    pictures: Sequence[Array], *, labels: Sequence[str] | None = None, columns: int | None = None, gap: int = 4
+) -> np.ndarray:
     """Pictures (H, W, 3) of one size on a white grid, each with its label above it.
 
     Args:

@@ -11,7 +11,10 @@ import errno
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+
+from zestjax.base.types import FilePath
 
 _SPACE, _RIGHTS = "free some space or choose another place", "choose a place that can be written to"
 _REMEDIES = {
@@ -27,12 +30,12 @@ class WriteError(OSError):
     """Something could not be written; the message says why and what to do."""
 
 
-def remedy(number):
+def remedy(number: int | None) -> str:
     """What to do about an error of the system when writing, by its `errno`."""
-    return _REMEDIES.get(number, "choose another place")
+    return _REMEDIES.get(number or 0, "choose another place")
 
 
-def check_writable(folder):
+def check_writable(folder: FilePath) -> None:
     """Refuse a folder that nothing can be written to, before any work is done for it. It may be missing.
 
     Raises:
@@ -51,17 +54,17 @@ def check_writable(folder):
         raise WriteError(number, f"{os.strerror(number)}; {remedy(number)}", str(folder)) from error
 
 
-def resolved(path):
+def resolved(path: FilePath) -> Path:
     """The absolute path behind links, also behind one to nothing yet."""
     return Path(os.path.realpath(path))
 
 
-def make_folder(path):
+def make_folder(path: FilePath) -> None:
     """Make a folder, and those above it, where missing; the folder behind a link."""
     resolved(path).mkdir(parents=True, exist_ok=True)
 
 
-def write_bytes(path, content):
+def write_bytes(path: FilePath, content: bytes) -> None:
     """Write a file atomically; its folder is made when missing.
 
     Raises:
@@ -88,7 +91,7 @@ def _write(path, content):
         raise
 
 
-def append_bytes(path, content):
+def append_bytes(path: FilePath, content: bytes) -> None:
     """Add to the end of a file, which is made when missing.
 
     Raises:
@@ -98,7 +101,7 @@ def append_bytes(path, content):
         file.write(content)
 
 
-def remove_parts(folder):
+def remove_parts(folder: FilePath) -> None:
     """Remove what `write_bytes` left in a folder when its process was killed; nobody else may write there meanwhile."""
     for part in Path(folder).glob(".*.part"):
         if part.is_file():
@@ -106,7 +109,7 @@ def remove_parts(folder):
 
 
 @contextlib.contextmanager
-def replaced_folder(path, *, marker):
+def replaced_folder(path: FilePath, *, marker: str) -> Iterator[Path]:
     """Context: yields an empty folder to fill, which takes the place of `path` once the block succeeds.
 
     Args:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from zestjax.base.types import Array, FilePath
 from zestjax.io.files import write_bytes
 from zestjax.io.reading import read_regular
 
@@ -11,7 +12,7 @@ TAG = b"PIEH"  # 202021.25 as float32
 UNKNOWN = 1e9  # a component beyond it marks a pixel whose flow is not known
 
 
-def read_flo(path):
+def read_flo(path: FilePath) -> tuple[np.ndarray, np.ndarray]:
     """(flow (H, W, 2) float32 pixels, 0 where not known; known (H, W) bool).
 
     Raises:
@@ -27,7 +28,7 @@ def read_flo(path):
     return np.where(known[..., None], flow, 0).astype(np.float32), known
 
 
-def write_flo(path, flow, *, known=None):
+def write_flo(path: FilePath, flow: Array, *, known: Array | None = None) -> None:
     """Write a flow (H, W, 2) in pixels, atomically; where `known` (H, W) is false it is marked as not known.
 
     Raises:

@@ -11,6 +11,7 @@ Depth bounds are the sphere's, over all cameras. Held out are photographs 23, 24
 """
 
 import re
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -29,12 +30,12 @@ OFF_CENTRE = (
 SIZED = re.compile(r"images_(\d+)x(\d+)")
 
 
-def is_idr(path):
+def is_idr(path: Path) -> bool:
     """Whether a folder is in this layout."""
     return any((path / name).is_file() for name in FILES) and bool(_pictures(path))
 
 
-def read_idr(path):
+def read_idr(path: Path) -> Record:
     """Read the folder to a `Record`.
 
     Raises:
@@ -45,9 +46,8 @@ def read_idr(path):
     images = _pictures(path)
     check_order(images, source)
     world, sphere, size = _matrices(source, len(images))
-    cameras = Camera._make(map(np.stack, zip(*(_camera(source, matrix) for matrix in world), strict=True)))
-    for leaf in cameras:
-        as_float32(source, leaf)
+    leaves = map(np.stack, zip(*(_camera(source, matrix) for matrix in world), strict=True))
+    cameras = Camera(*(as_float32(source, leaf) for leaf in leaves))
     near, far = _bounds(source, cameras, sphere)
     count = len(images)
     reserved = DTU_RESERVED if count == DTU_COUNT else every_eighth(count)

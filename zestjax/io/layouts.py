@@ -6,13 +6,14 @@ lists them and does the rest, the same way for all.
     native size   (height, width) in which the record's cameras count pixels; pictures may be stored in another
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
+from zestjax.base.types import FilePath
 from zestjax.cameras import Camera
 from zestjax.io.pictures import SUFFIXES
 from zestjax.io.reading import in_order, numbers_of, visible
@@ -76,7 +77,7 @@ class Record:
     reserved: tuple[int, ...] = ()
 
 
-def bounds_from_frames(bounds, *, where="bounds_from_frames"):
+def bounds_from_frames(bounds: np.ndarray, *, where: FilePath = "bounds_from_frames") -> tuple[float, float]:
     """Depth bounds of a scene from those of its frames: (N, 2) -> (near, far).
 
     near is 0.9 times the 5th percentile of the nears, far the 95th percentile of the fars divided by 0.9: structure
@@ -100,22 +101,22 @@ def bounds_from_frames(bounds, *, where="bounds_from_frames"):
     return 0.9 * float(np.percentile(bounds[:, 0], 5)), float(np.percentile(bounds[:, 1], 95)) / 0.9
 
 
-def every_eighth(count):
+def every_eighth(count: int) -> tuple[int, ...]:
     """The frames that LLFF's convention holds out of `count` photographs."""
     return tuple(range(0, count, 8))
 
 
-def pictures_in(folder):
+def pictures_in(folder: FilePath) -> tuple[Path, ...]:
     """Picture files of a folder (not of folders in it), by number or name; empty when there is no such folder."""
     return files_in(folder, SUFFIXES)
 
 
-def files_in(folder, suffixes):
+def files_in(folder: FilePath, suffixes: Collection[str]) -> tuple[Path, ...]:
     """The files of a folder with one of some suffixes, hidden ones left out, as `zestjax.io.reading.in_order`."""
     return in_order(p for p in visible(folder) if p.suffix.lower() in suffixes)
 
 
-def check_order(images, source):
+def check_order(images: Sequence[Path], source: Path) -> None:
     """Refuse pictures whose order by name is not that of their numbers: it is not known which one the poses have.
 
     Raises:
@@ -131,7 +132,7 @@ def check_order(images, source):
         )
 
 
-def one_each(folder, files, images):
+def one_each(folder: FilePath, files: Sequence[Path], images: Sequence[Path]) -> dict[int, Path]:
     """{frame: file} with a file for every frame: that of its name, else of its number, else of its place.
 
     Raises:
@@ -148,7 +149,7 @@ def one_each(folder, files, images):
     return dict(enumerate(files))
 
 
-def check_sizes(source, sizes):
+def check_sizes(source: FilePath, sizes: np.ndarray) -> tuple[tuple[int, int], np.ndarray]:
     """(height, width) and focal lengths of poses' columns (N, 3), once they are those of one video.
 
     Raises:
@@ -164,7 +165,7 @@ def check_sizes(source, sizes):
     return (max(round(sizes[0, 0]), 1), max(round(sizes[0, 1]), 1)), sizes[:, 2]
 
 
-def as_float32(source, poses):
+def as_float32(source: FilePath, poses: np.ndarray) -> np.ndarray:
     """Poses as float32.
 
     Raises:
@@ -177,7 +178,9 @@ def as_float32(source, poses):
     return poses
 
 
-def frames_by_number(images, numbers, *, fits):
+def frames_by_number(
+    images: Sequence[Path], numbers: Iterable[int], *, fits: Callable[[dict[int, int]], bool]
+) -> dict[int, int] | None:
     """Which frames some numbers in names mean: {number: frame}, or None if neither reading fits.
 
     They are the numbers in the frames' names where all of them are there, else places from 0.
@@ -194,6 +197,6 @@ def frames_by_number(images, numbers, *, fits):
     return None
 
 
-def select(cameras, index):
+def select(cameras: Camera, index: int | slice | Sequence[int] | np.ndarray) -> Camera:
     """The camera, or cameras, at an index of the leading axis."""
     return Camera._make(np.asarray(leaf)[index] for leaf in cameras)

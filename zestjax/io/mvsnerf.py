@@ -3,6 +3,7 @@
 published names   `fn/nerf.pts_linears.0.weight` (the field) and `mvs/feature.conv0.0.conv.weight` (the volume's nets)
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax.base.checks import check_option
+from zestjax.base.types import FilePath
 from zestjax.fields.trunk import ColourHead, Trunk
 from zestjax.io.torch_files import read_named_arrays
 from zestjax.io.weights import WeightsError
@@ -22,7 +24,7 @@ REMEDY = "give MVSNeRF's released checkpoint (mvsnerf-v0)."
 PARTS = {"fn": "network_fn_state_dict", "mvs": "network_mvs_state_dict"}
 
 
-def read_mvsnerf(path, *, statistics="batch"):
+def read_mvsnerf(path: FilePath, *, statistics: str = "batch") -> MvsNerfParams:
     """Published weights as `mvsnerf.MvsNerfParams`.
 
     Args:
@@ -50,7 +52,7 @@ def read_mvsnerf(path, *, statistics="batch"):
     return params
 
 
-def mvsnerf_like(*, statistics="batch"):
+def mvsnerf_like(*, statistics: str = "batch") -> MvsNerfParams:
     """Shapes and types of `read_mvsnerf`'s result."""
     return jax.eval_shape(MvsNerf(statistics=statistics).init, jax.random.key(0))
 
@@ -67,7 +69,7 @@ def _published(path):
     return saved
 
 
-def mvsnerf_params(arrays, *, statistics="batch"):
+def mvsnerf_params(arrays: Mapping[str, np.ndarray], *, statistics: str = "batch") -> MvsNerfParams:
     """`MvsNerfParams` of arrays by published name; see `read_mvsnerf`.
 
     Kernels come as (out, in, ...), of transposed convolutions as (in, out, ...).

@@ -5,6 +5,7 @@ picture of any instant.
 """
 
 import re
+from pathlib import Path
 
 import numpy as np
 
@@ -13,12 +14,12 @@ from zestjax.io.layouts import Record, as_float32, bounds_from_frames, check_siz
 from zestjax.io.reading import json_numbers, read_json
 
 
-def is_nrnerf(path):
+def is_nrnerf(path: Path) -> bool:
     """Whether a folder is in this layout."""
     return (path / "precomputed.json").is_file()
 
 
-def read_nrnerf(path):
+def read_nrnerf(path: Path) -> Record:
     """Read the folder to a `Record`.
 
     A picture belongs to the pose that its number says, counted from the lowest number present when there are as many

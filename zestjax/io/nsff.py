@@ -21,9 +21,12 @@ and, where the truth is known, `truth/00000.npz` by frame and `truth/00000_cam02
 
 import json
 import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from zestjax.base.types import Array, FilePath
 from zestjax.cameras import Camera, camera_from_llff_pose, check_camera
 from zestjax.io.files import replaced_folder
 from zestjax.io.layouts import (
@@ -44,17 +47,18 @@ from zestjax.io.layouts import (
 from zestjax.io.pictures import SUFFIXES, write_image
 from zestjax.io.reading import check_numbers, json_numbers, numbers_of, read_array, read_arrays, read_json, visible
 from zestjax.io.rig import find_rig, numbered, targets_of
+from zestjax.video import Video
 
 MARKER = "poses_bounds.npy"
 
 
-def is_nsff(path):
+def is_nsff(path: Path) -> bool:
     """Whether a folder is in this layout."""
     root = _root(path)
     return (root / MARKER).is_file() and bool(_frames(root))
 
 
-def read_nsff(path):
+def read_nsff(path: Path) -> Record:
     """Read the folder to a `Record`.
 
     Raises:
@@ -110,17 +114,17 @@ def _about(path):
 
 
 def write_nsff(
-    folder,
-    name,
-    video,
+    folder: FilePath,
+    name: str,
+    video: Video,
     *,
-    motion_masks=None,
-    disparity=None,
-    flow_forward=None,
-    flow_backward=None,
-    truth=None,
-    held_out=(),
-):
+    motion_masks: Array | None = None,
+    disparity: Array | None = None,
+    flow_forward: tuple[Array, Array] | None = None,
+    flow_backward: tuple[Array, Array] | None = None,
+    truth: Sequence[Mapping[str, Array]] | None = None,
+    held_out: Iterable = (),
+) -> None:
     """Write a scene in this layout, all or nothing.
 
     Args:
@@ -160,7 +164,7 @@ def write_nsff(
             _write_target(root, target)
 
 
-def poses_bounds(video):
+def poses_bounds(video: Video) -> np.ndarray:
     """(N, 17) rows of `poses_bounds.npy`.
 
     Raises:

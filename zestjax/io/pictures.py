@@ -5,11 +5,13 @@ T        frames of a video
 """
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from zestjax.base.types import Array, FilePath
 from zestjax.io.claims import claimed_size, most_pixels
 from zestjax.io.files import write_bytes
 from zestjax.io.reading import FileWarning, read_regular, silenced_stderr
@@ -21,7 +23,7 @@ MOST_GREY = 0.01  # of a mask's pixels before it is doubted: edges of a JPEG sta
 UNREADABLE = "is not a picture that can be read (truncated, or none of PNG, JPEG, BMP, WebP and TIFF); replace it."
 
 
-def read_image(path, *, native=None):
+def read_image(path: FilePath, *, native: tuple[int, int] | None = None) -> np.ndarray:
     """An image file as (H, W, 3) float32 RGB in [0, 1], its pixels as they are stored; grey becomes RGB.
 
     A tag that asks viewers to turn the picture (EXIF) is not followed: poses are of the pixels as stored. What lies
@@ -47,7 +49,7 @@ def read_image(path, *, native=None):
     return np.ascontiguousarray(shades).astype(np.float32) / _full(pixels)
 
 
-def read_mask(path, *, native=None):
+def read_mask(path: FilePath, *, native: tuple[int, int] | None = None) -> np.ndarray:
     """The mask of `doubted_mask`, with a `FileWarning` where it is doubtful; raises as that."""
     mask, doubt = doubted_mask(path, native=native)
     if doubt:
@@ -55,14 +57,14 @@ def read_mask(path, *, native=None):
     return mask
 
 
-def mask_warning(doubts):
+def mask_warning(doubts: Mapping[FilePath, str]) -> str:
     """One sentence on the masks that are doubtful: {path: what `doubted_mask` says}, not empty."""
     path, doubt = next(iter(doubts.items()))
     others = f" (and {len(doubts) - 1} more masks like it)" if len(doubts) > 1 else ""
     return f"{path}: {doubt}{others}; a mask is white where pixels move, black elsewhere: look at it."
 
 
-def doubted_mask(path, *, native=None):
+def doubted_mask(path: FilePath, *, native: tuple[int, int] | None = None) -> tuple[np.ndarray, str | None]:
     """An image file as (H, W) bool: true where it is brighter than half, or is not 0 where its values are 0 and 1.
 
     Of colours the brightest counts, and transparent pixels are black; of one colour all over, opacity is the mask.
@@ -89,7 +91,7 @@ def doubted_mask(path, *, native=None):
     return share > 0.5, _doubt(share)
 
 
-def image_size(path):
+def image_size(path: FilePath) -> tuple[int, int]:
     """(height, width) of an image file, as it is stored.
 
     Raises:
@@ -98,7 +100,7 @@ def image_size(path):
     return _decode(path).shape[:2]
 
 
-def check_fits(path, have, native):
+def check_fits(path: FilePath, have: tuple[int, int], native: tuple[int, int] | None) -> None:
     """Refuse a picture, or a map of its pixels, that was cropped or turned, so that no camera of its poses took it.
 
     One that was resized passes, with the rounding that this takes: up to a pixel, or two if they are below 1 %.
@@ -117,7 +119,7 @@ def check_fits(path, have, native):
     off, side = abs(width * rows - height * columns), max(rows, columns)
     resized = off <= side or (off <= 2 * side and off <= MOST_OFF * height * columns)
     if not resized or height == rows or width == columns:
-        turned = path.suffix.lower() in SUFFIXES and _as_viewers_show(path).shape[:2] != (height, width)
+        turned = Path(path).suffix.lower() in SUFFIXES and _as_viewers_show(path).shape[:2] != (height, width)
         hint = " (turned by EXIF? viewers show it turned, by a tag in it)" if turned else ""
         raise ValueError(
             f"{path}: has {height}x{width} pixels (HxW), but its poses are of {rows}x{columns}{hint}; "
@@ -125,7 +127,7 @@ def check_fits(path, have, native):
         )
 
 
-def write_image(path, picture):
+def write_image(path: FilePath, picture: Array) -> None:
     """Write a picture, or a (H, W) bool mask, in the format that the path's suffix names; the folder is made.
 
     Raises:
@@ -139,7 +141,7 @@ def write_image(path, picture):
     write_bytes(path, content.tobytes())
 
 
-def to_bytes(picture):
+def to_bytes(picture: Array) -> np.ndarray:
     """Floats in [0, 1] (clipped) or booleans to uint8, rounded; uint8 is unchanged. Any leading axes.
 
     Raises:
@@ -157,7 +159,7 @@ def to_bytes(picture):
     return np.round(np.clip(pixels, 0, 1) * 255).astype(np.uint8)
 
 
-def resize_area(picture, height, width):
+def resize_area(picture: np.ndarray, height: int, width: int) -> np.ndarray:
     """A float picture (H, W, 3) in [0, 1] resized by the area its pixels cover; enlarged bilinearly."""
     have = picture.shape[:2]
     if have == (height, width):
@@ -167,7 +169,7 @@ def resize_area(picture, height, width):
     return np.clip(resized, 0, 1)  # OpenCV's sums exceed 1 by rounding
 
 
-def resize_nearest(values, height, width):
+def resize_nearest(values: np.ndarray, height: int, width: int) -> np.ndarray:
     """(H, W, ...) values of any type at the pixel centres of another size: masks, depths and flows are never mixed."""
     rows, columns = (
         np.minimum(((np.arange(size) + 0.5) * have / size).astype(int), have - 1)

@@ -14,11 +14,14 @@ import re
 import stat
 import warnings
 import zipfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from zestjax.base.checks import pose_hint
+from zestjax.base.types import FilePath
 
 MOST_BYTES = 2**30  # of a file: a depth map and a flow of 8K have 400 MB
 CHUNK = 2**20  # bytes
@@ -34,7 +37,7 @@ class FileWarning(UserWarning):
 
 
 @contextlib.contextmanager
-def open_regular(path, *, most=MOST_BYTES):
+def open_regular(path: FilePath, *, most: int = MOST_BYTES) -> Iterator[tuple[BinaryIO, int]]:
     """Context: (file, bytes in it) of a regular file. Nothing else is ever opened.
 
     Raises:
@@ -52,7 +55,7 @@ def open_regular(path, *, most=MOST_BYTES):
         raise ValueError(f"{path}: could not be read ({error.strerror or error}); check the path.") from error
 
 
-def read_regular(path, *, most=MOST_BYTES):
+def read_regular(path: FilePath, *, most: int = MOST_BYTES) -> bytes:
     """The bytes of a regular file; raises as `open_regular`."""
     with open_regular(path, most=most) as (file, size):
         content = file.read(size)  # Python takes memory for as much as is asked for
@@ -63,7 +66,7 @@ def read_regular(path, *, most=MOST_BYTES):
         return content
 
 
-def read_array(path, *, shape=None):
+def read_array(path: FilePath, *, shape: Sequence[int | None] | None = None) -> np.ndarray:
     """The array of an .npy file: numbers, of the shape given.
 
     Args:
@@ -82,7 +85,7 @@ def read_array(path, *, shape=None):
     return check_numbers(path, array, shape=shape)
 
 
-def read_arrays(path, *, names=None):
+def read_arrays(path: FilePath, *, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """Arrays of an .npz file, by name, as they are stored; those of Python objects are refused.
 
     Args:
@@ -106,7 +109,14 @@ def read_arrays(path, *, names=None):
             return {name: _array(archive.read(info)) for name, info in wanted.items()}
 
 
-def check_numbers(path, array, *, shape=None, name=None, finite=False):
+def check_numbers(
+    path: FilePath,
+    array: Any,
+    *,
+    shape: Sequence[int | None] | None = None,
+    name: str | None = None,
+    finite: bool = False,
+) -> np.ndarray:
     """The array, if it holds real numbers or booleans.
 
     Args:
@@ -134,7 +144,7 @@ def check_numbers(path, array, *, shape=None, name=None, finite=False):
     return array
 
 
-def read_json(path):
+def read_json(path: FilePath) -> dict[str, Any]:
     """The object (dict) of a JSON file: UTF-8 with or without a mark, or UTF-16 by its mark, whatever the locale.
 
     Raises:
@@ -148,7 +158,7 @@ def read_json(path):
     return found
 
 
-def parse_json(content, *, constant=None):
+def parse_json(content: bytes, *, constant: Callable[[str], Any] | None = None) -> Any:
     """What bytes of JSON hold.
 
     Args:
@@ -165,7 +175,9 @@ def parse_json(content, *, constant=None):
         raise ValueError("it is nested too deeply") from error
 
 
-def json_numbers(path, found, name, *, shape=None):
+def json_numbers(
+    path: FilePath, found: Mapping[str, Any], name: str, *, shape: Sequence[int | None] | None = None
+) -> np.ndarray:
     """The numbers of one name in an object of JSON, as finite float64.
 
     Raises:
@@ -178,7 +190,7 @@ def json_numbers(path, found, name, *, shape=None):
     return check_numbers(path, array, shape=shape, name=name, finite=True).astype(np.float64)
 
 
-def visible(folder):
+def visible(folder: FilePath) -> tuple[Path, ...]:
     """What lies in a folder but hidden names, see `in_order`; empty where there is no such folder.
 
     Raises:
@@ -192,7 +204,7 @@ def visible(folder):
     return in_order(p for p in found if not p.name.startswith(".") and p.name not in HIDDEN)
 
 
-def in_order(paths):
+def in_order(paths: Iterable[Path]) -> tuple[Path, ...]:
     """Paths by number if their names differ in digits only, else by name: a tuple."""
     paths = sorted(paths, key=lambda path: path.name)
     if len({re.sub(r"\d+", "0", path.stem) for path in paths}) != 1:
@@ -200,7 +212,7 @@ def in_order(paths):
     return tuple(sorted(paths, key=lambda path: [int(digits) for digits in re.findall(r"\d+", path.stem)]))
 
 
-def numbers_of(paths):
+def numbers_of(paths: Sequence[Path]) -> tuple[int, ...] | None:
     """The number of each path, where the names differ in one run of digits; None where they do not tell.
 
     A single name's number is its last run of digits.
@@ -215,7 +227,7 @@ def numbers_of(paths):
 
 
 @contextlib.contextmanager
-def silenced_stderr():
+def silenced_stderr() -> Iterator[None]:
     """Context: what libraries in C write to file descriptor 2 is dropped: an error is said once, by us."""
     try:
         saved, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)

@@ -14,11 +14,13 @@ picture; the reading that explains most is taken, if no other explains as much. 
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from zestjax.base.types import FilePath
 from zestjax.io.pictures import read_image, resize_area
 
 GRID = (48, 64)  # most rows and columns at which photographs are compared: compression and resizing even out
@@ -39,7 +41,7 @@ class Rig(NamedTuple):
     size: int
     numbers: Mapping[int, int]
 
-    def own(self, time):
+    def own(self, time: int) -> int | None:
         """The number of the camera that took a frame, or None where no picture has its number."""
         return self.numbers.get(time % self.size)
 
@@ -52,7 +54,7 @@ class _Look(NamedTuple):
     itself: int | None
 
 
-def numbered(by_time):
+def numbered(by_time: Mapping[int, Sequence[Path]]) -> dict[int, dict[int, Path]]:
     """Files by number.
 
     Args:
@@ -76,7 +78,7 @@ def numbered(by_time):
     return pictures
 
 
-def find_rig(folder, images, pictures):
+def find_rig(folder: FilePath, images: Sequence[Path], pictures: Mapping[int, Mapping[int, Path]]) -> Rig:
     """Find which camera has which number.
 
     Args:
@@ -105,7 +107,7 @@ def find_rig(folder, images, pictures):
     raise ValueError(f"{folder}: {_reason(convention, looks, pictures)}")
 
 
-def targets_of(rig, pictures, count):
+def targets_of(rig: Rig, pictures: Mapping[int, Mapping[int, Path]], count: int) -> list[tuple[int, int, int]]:
     """[(time, number, place)] of the pictures that are held out of `count` frames.
 
     Left out are the frames' own pictures, and those of cameras whose place has no frame, so that no pose is known.

@@ -15,13 +15,14 @@ A protocol says what the targets are:
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from zestjax.base.checks import check_option
+from zestjax.base.types import FilePath
 from zestjax.cameras import Camera, resized
 from zestjax.frames.inputs import check_inputs
 from zestjax.io.idr import is_idr, read_idr
@@ -97,7 +98,16 @@ class Scene:
     stored: tuple[int, int] | None = None
 
 
-def load_scene(path, *, height=None, width=None, layout=None, protocol="held-out", targets=None, exclude=()):
+def load_scene(
+    path: FilePath,
+    *,
+    height: int | None = None,
+    width: int | None = None,
+    layout: str | None = None,
+    protocol: str = "held-out",
+    targets: Sequence[int] | Sequence[tuple[int, str]] | None = None,
+    exclude: Collection[int] = (),
+) -> Scene:
     """Read a scene from a folder; the protocol `paper` is the released ZeST-NeRF's.
 
     Differs from the reference: frames that are predicted are never among the inputs, but with `paper`.

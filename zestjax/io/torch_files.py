@@ -17,11 +17,12 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.types import FilePath
 from zestjax.io.reading import check_numbers, read_arrays, read_regular
 from zestjax.io.weights import WeightsError
 
@@ -43,7 +44,7 @@ class TorchFileError(ValueError):
     """Not a PyTorch file, a damaged one, or one that holds more than arrays in lists and dicts."""
 
 
-def read_torch(path):
+def read_torch(path: FilePath) -> Any:
     """What a file holds, its tensors as numpy arrays.
 
     Args:
@@ -72,7 +73,7 @@ def read_torch(path):
         ) from error
 
 
-def read_named_arrays(path):
+def read_named_arrays(path: FilePath) -> dict[str, np.ndarray]:
     """A dict of a PyTorch file, or of an npz, which is how such a file's arrays are handed on without PyTorch.
 
     Raises:

@@ -15,12 +15,13 @@ import cv2
 import numpy as np
 
 from zestjax.base.checks import check_shapes
+from zestjax.base.types import Array, FilePath
 from zestjax.io.files import write_bytes
 from zestjax.io.pictures import to_bytes
 from zestjax.io.reading import silenced_stderr
 
 
-def write_video(path_stem, frames, *, fps=24):
+def write_video(path_stem: FilePath, frames: Array, *, fps: float = 24) -> Path:
     """Write a video as VP8 in WebM, or, where this OpenCV cannot, as an animated WebP.
 
     Args:
@@ -56,7 +57,7 @@ def write_video(path_stem, frames, *, fps=24):
     )
 
 
-def read_video(path):
+def read_video(path: FilePath) -> np.ndarray:
     """Frames (T, H, W, 3) uint8 RGB of a video or an animated picture.
 
     Raises:

@@ -6,7 +6,9 @@ and a SHA-256 over names, types, shapes, values and that metadata.
 
 import hashlib
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
+from zestjax.base.types import FilePath, Tree
 from zestjax.io.files import write_bytes
 from zestjax.io.reading import open_regular, parse_json
 
@@ -42,7 +45,7 @@ class UnreadableFileError(WeightsError):
     """There is a file of that name, and it cannot be read: the disk's fault, no permission, or no regular file."""
 
 
-def save_weights(path, params, *, metadata):
+def save_weights(path: FilePath, params: Tree, *, metadata: Mapping[str, Any]) -> None:
     """Write a tree of arrays and its metadata to one file, atomically.
 
     Args:
@@ -78,7 +81,9 @@ def _plain(value, place="metadata", kinds=(dict,)):
     return {key: _plain(entry, f"{place}[{key!r}]", JSON) for key, entry in value.items()}
 
 
-def load_weights(path, *, like=None, renamed=None):
+def load_weights(
+    path: FilePath, *, like: Tree = None, renamed: Callable[[str], str] | None = None
+) -> tuple[Any, dict[str, Any]]:
     """Read what `save_weights` wrote.
 
     Args:
@@ -111,7 +116,7 @@ def load_weights(path, *, like=None, renamed=None):
     return jax.tree.unflatten(jax.tree.structure(like), leaves), metadata
 
 
-def read_metadata(path):
+def read_metadata(path: FilePath) -> dict[str, Any]:
     """The metadata dict of a weights file, verified as by `load_weights`.
 
     Raises:

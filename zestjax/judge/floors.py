@@ -9,6 +9,7 @@ H W      rows and columns of the frames, and of the prediction
 slot     a neighbour's time minus the target's
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -17,8 +18,10 @@ import numpy as np
 
 from zestjax.base.checks import check_shapes
 from zestjax.base.numerics import safe_divide, safe_norm
+from zestjax.base.types import Array
 from zestjax.cameras import Camera, centre
 from zestjax.planesweep import homographies, plane_depths, warp
+from zestjax.video import Video
 
 SLOTS = (-2, -1, 0, 1, 2)
 LEAST_OVERLAP = 0.5
@@ -52,7 +55,7 @@ class PlaneWarped(NamedTuple):
     overlap: jax.Array
 
 
-def nearest_frame(video, camera, time, *, exclude=()):
+def nearest_frame(video: Video, camera: Camera, time: int | Array, *, exclude: Sequence[int] | Array = ()) -> Nearest:
     """The input nearest in time, and among those the nearest in camera position.
 
     Source: zestjax, accuracy floor 1.
@@ -79,7 +82,15 @@ def nearest_frame(video, camera, time, *, exclude=()):
     return Nearest(video.images[index], index)
 
 
-def plane_warp(video, camera, time, *, exclude=(), slots=SLOTS, planes=32):
+def plane_warp(
+    video: Video,
+    camera: Camera,
+    time: int | Array,
+    *,
+    exclude: Sequence[int] | Array = (),
+    slots: Sequence[int] = SLOTS,
+    planes: int = 32,
+) -> PlaneWarped:
     """The valid neighbours, warped by the plane on which they agree best and averaged where they see.
 
     A neighbour is valid when its time exists, it is not excluded, and at slot 0 it is another camera's picture.

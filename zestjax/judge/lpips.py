@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from zestjax.base.checks import check_shapes
-from zestjax.base.numerics import safe_norm
+from zestjax.base.numerics import added, safe_norm
+from zestjax.base.types import Array
 from zestjax.metrics import mean_where
 from zestjax.nets.layers import Conv
 
@@ -33,7 +34,7 @@ class LpipsParams(NamedTuple):
     heads: tuple[jax.Array, ...]
 
 
-def lpips_like():
+def lpips_like() -> LpipsParams:
     """Shapes and types of `LpipsParams`."""
     array = lambda *shape: jnp.zeros(shape, jnp.float32)
 
@@ -44,22 +45,23 @@ def lpips_like():
     return jax.eval_shape(made)
 
 
-def alexnet_activations(params, image):
+def alexnet_activations(params: LpipsParams, image: Array) -> list[jax.Array]:
     """AlexNet's five activations after the ReLU, of one image (H, W, 3) in [0, 1]: a list of (h, w, C)."""
     row = lambda values: jnp.asarray(values, image.dtype)[None, None]
-    x = ((2 * image - 1 - row(SHIFT)) / row(SCALE))[None]
+    x = ((2 * jnp.asarray(image) - 1 - row(SHIFT)) / row(SCALE))[None]
     found = []
     for i, layer in enumerate(params.convolutions):
         if i in POOLED:
             x = lax.reduce_window(x, -jnp.inf, lax.max, (1, 3, 3, 1), (1, 2, 2, 1), "VALID")
         padding, stride = [(PADDING[i], PADDING[i])] * 2, (STRIDES[i],) * 2
         x = lax.conv_general_dilated(x, layer.kernel, stride, padding, dimension_numbers=IMAGES)
+        assert layer.bias is not None  # `lpips_like` has one
         x = jax.nn.relu(x + layer.bias[None, None, None])
         found.append(x[0])
     return found
 
 
-def lpips_maps(params, image, truth):
+def lpips_maps(params: LpipsParams, image: Array, truth: Array) -> list[jax.Array]:
     """The distance at every place of every layer: a list of (h, w)."""
     unit = lambda x: x / (safe_norm(x, axis=-1, keepdims=True) + 1e-10)
     pairs = zip(*(alexnet_activations(params, picture) for picture in (image, truth)), strict=True)
@@ -69,7 +71,7 @@ def lpips_maps(params, image, truth):
     ]
 
 
-def lpips(params, image, truth, *, mask=None):
+def lpips(params: LpipsParams, image: Array, truth: Array, *, mask: Array | None = None) -> jax.Array:
     """LPIPS distance of two pictures, 0 for equal ones.
 
     Source: LPIPS (Zhang et al. 2018) eq. 1, weights of version 0.1.
@@ -93,6 +95,6 @@ def lpips(params, image, truth, *, mask=None):
         raise ValueError(f"lpips: `image` is {sizes['H']}x{sizes['W']} (HxW), expected at least 31x31.")
     maps = lpips_maps(params, image, truth)
     if mask is None:
-        return sum(jnp.mean(m) for m in maps)
+        return added(jnp.mean(m) for m in maps)
     enlarged = [jax.image.resize(m, (sizes["H"], sizes["W"]), "bilinear") for m in maps]
-    return mean_where(sum(enlarged), mask, where="lpips")
+    return mean_where(added(enlarged), mask, where="lpips")

@@ -9,16 +9,20 @@ residual's further axes share its value. A norm printed in the paper is a mean o
 released code, so that the published weights keep their meaning.
 """
 
+from collections.abc import Sequence
+
+import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_option
 from zestjax.base.numerics import masked_mean
+from zestjax.base.types import Array
 
 NORMS = {"absolute": jnp.abs, "squared": jnp.square}
 NORMALISERS = ("count", "confidence")
 
 
-def spread_mask(where, name, mask, shape):
+def spread_mask(where: str, name: str, mask: Array | None, shape: Sequence[int]) -> jax.Array:
     """A mask with the leading axes of `shape`, broadcast to it; None is all ones.
 
     Args:
@@ -44,7 +48,15 @@ def spread_mask(where, name, mask, shape):
     return mask.reshape(mask.shape + (1,) * missing)
 
 
-def mean_over_valid(where, residual, *, norm=None, valid=None, confidence=None, normalise="count"):
+def mean_over_valid(
+    where: str,
+    residual: Array,
+    *,
+    norm: str | None = None,
+    valid: Array | None = None,
+    confidence: Array | None = None,
+    normalise: str = "count",
+) -> jax.Array:
     """Mean of confidence * norm(residual) over what is valid; exactly 0, with a 0 gradient, when nothing is.
 
     What is not valid may hold NaN or infinity: neither the value nor the gradient sees it.

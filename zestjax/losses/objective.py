@@ -84,7 +84,9 @@ def measured(measures: Mapping[str, Callable], prediction: Any, batch: Any, weig
     return values
 
 
-def make_objective(predict: Callable, measures: Mapping[str, Callable], *, weights: Mapping[str, Any] | None = None):
+def make_objective(
+    predict: Callable, measures: Mapping[str, Callable], *, weights: Mapping[str, Any] | None = None
+) -> Callable[..., tuple[jax.Array, dict[str, Any]]]:
     """Bind a model and its losses into what a solver wants.
 
     Args:
@@ -100,7 +102,7 @@ def make_objective(predict: Callable, measures: Mapping[str, Callable], *, weigh
     """
     declared = None if weights is None else present(weights)
 
-    def objective(params, batch, weights=declared):
+    def objective(params: Any, batch: Any, weights: Mapping[str, Any] | None = declared):
         if weights is None:
             raise ValueError("objective: no `weights`, neither here nor in make_objective.")
         if declared is not None:

@@ -5,13 +5,17 @@ target      (..., 3)  true RGB in [0, 1]
 M           neighbouring times that the scene is warped from
 """
 
+import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
+from zestjax.base.types import Array
 from zestjax.losses.means import mean_over_valid
 
 
-def reconstruction_loss(colour, target, *, valid=None, norm="squared"):
+def reconstruction_loss(
+    colour: Array, target: Array, *, valid: Array | None = None, norm: str = "squared"
+) -> jax.Array:
     """Mean squared error of the blended colour (or of any other render).
 
     Source: ZeST-NeRF eq. 10.
@@ -33,7 +37,9 @@ def reconstruction_loss(colour, target, *, valid=None, norm="squared"):
     return mean_over_valid("reconstruction_loss", colour - target, norm=norm, valid=valid)
 
 
-def photometric_loss(warped, target, confidence, *, valid=None, normalise="count"):
+def photometric_loss(
+    warped: Array, target: Array, confidence: Array, *, valid: Array | None = None, normalise: str = "count"
+) -> jax.Array:
     """Neighbouring times, warped to time t, should look like the frame at t where that is certain.
 
     Source: ZeST-NeRF eq. 11.

@@ -5,14 +5,16 @@ pixels   (..., 2)  (u, v)
 valid    in [0, 1]; 0 leaves a pixel out
 """
 
+import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
+from zestjax.base.types import Array
 from zestjax.depth import FLAT, whitened
 from zestjax.losses.means import mean_over_valid
 
 
-def geometric_loss(pixels, target_pixels, *, valid=None):
+def geometric_loss(pixels: Array, target_pixels: Array, *, valid: Array | None = None) -> jax.Array:
     """Where scene flow takes a ray's point in the neighbouring image, against where optical flow does.
 
     Source: ZeST-NeRF eq. 21.
@@ -33,7 +35,9 @@ def geometric_loss(pixels, target_pixels, *, valid=None):
     return mean_over_valid("geometric_loss", pixels - target_pixels, norm="absolute", valid=valid)
 
 
-def depth_loss(depth, target, *, valid=None, norm="absolute", floor=FLAT):
+def depth_loss(
+    depth: Array, target: Array, *, valid: Array | None = None, norm: str = "absolute", floor: float = FLAT
+) -> jax.Array:
     """Rendered depth against a depth known up to a scale > 0 and a shift.
 
     Source: ZeST-NeRF eq. 22.

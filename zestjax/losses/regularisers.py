@@ -10,12 +10,15 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_option, check_shapes
+from zestjax.base.types import Array
 from zestjax.losses.means import mean_over_valid
 
 LEAST = 1e-7  # a probability under which its logarithm is held
 
 
-def blend_entropy_loss(blend, *, given="probability", symmetric=False, valid=None):
+def blend_entropy_loss(
+    blend: Array, *, given: str = "probability", symmetric: bool = False, valid: Array | None = None
+) -> jax.Array:
     """Each sample should belong to one field: -b log b.
 
     Source: ZeST-NeRF eq. 15.
@@ -43,7 +46,7 @@ def blend_entropy_loss(blend, *, given="probability", symmetric=False, valid=Non
     return mean_over_valid("blend_entropy_loss", cost, valid=valid)
 
 
-def disocclusion_loss(confidence, *, valid=None):
+def disocclusion_loss(confidence: Array, *, valid: Array | None = None) -> jax.Array:
     """Confidences should be near one unless there is cause: |w - 1|.
 
     Source: ZeST-NeRF eq. 14.
@@ -62,7 +65,7 @@ def disocclusion_loss(confidence, *, valid=None):
     return mean_over_valid("disocclusion_loss", confidence - 1, norm="absolute", valid=valid)
 
 
-def distortion_loss(weights, edges, *, valid=None):
+def distortion_loss(weights: Array, edges: Array, *, valid: Array | None = None) -> jax.Array:
     """Weights of a ray should lie together: sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 length_i.
 
     Source: mip-NeRF 360 (Barron et al. 2022), eq. 15.
@@ -91,7 +94,9 @@ def distortion_loss(weights, edges, *, valid=None):
     return mean_over_valid("distortion_loss", pairs + jnp.sum(weights**2 * lengths, axis=-1) / 3, valid=valid)
 
 
-def edge_aware_depth_loss(disparity, image, *, valid=None, relative=True):
+def edge_aware_depth_loss(
+    disparity: Array, image: Array, *, valid: Array | None = None, relative: bool = True
+) -> jax.Array:
     """Disparity should be smooth where the image is: |d disparity| exp(-|d image|), both over rows and columns.
 
     Source: Monodepth2 (Godard et al. 2019), eq. 3.

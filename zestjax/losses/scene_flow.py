@@ -8,14 +8,24 @@
 Convert flows from frustum units with `flow.world_flow` first.
 """
 
+import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_option, check_shapes
 from zestjax.base.numerics import safe_norm
+from zestjax.base.types import Array
 from zestjax.losses.means import mean_over_valid
 
 
-def cycle_loss(flow_there, flow_back, confidence, *, valid=None, norm="absolute", normalise="count"):
+def cycle_loss(
+    flow_there: Array,
+    flow_back: Array,
+    confidence: Array,
+    *,
+    valid: Array | None = None,
+    norm: str = "absolute",
+    normalise: str = "count",
+) -> jax.Array:
     """Going to the neighbour and back should return home: w |f_there(x) + f_back(x + f_there)|.
 
     Source: ZeST-NeRF eq. 16.
@@ -40,7 +50,7 @@ def cycle_loss(flow_there, flow_back, confidence, *, valid=None, norm="absolute"
     return mean_over_valid("cycle_loss", residual, norm=norm, valid=valid, confidence=confidence, normalise=normalise)
 
 
-def minimum_flow_loss(flow, *, valid=None, sum_components=False):
+def minimum_flow_loss(flow: Array, *, valid: Array | None = None, sum_components: bool = False) -> jax.Array:
     """Most of space stands still: |f|.
 
     Source: ZeST-NeRF eq. 17.
@@ -63,7 +73,9 @@ def minimum_flow_loss(flow, *, valid=None, sum_components=False):
     return mean_over_valid("minimum_flow_loss", residual, norm="absolute", valid=valid)
 
 
-def spatial_smoothness_loss(flow, points, *, valid=None, weighting="distance", drop_far=0.0):
+def spatial_smoothness_loss(
+    flow: Array, points: Array, *, valid: Array | None = None, weighting: str = "distance", drop_far: float = 0.0
+) -> jax.Array:
     """Neighbouring points move alike: exp(-2 |x - y|) |f(x) - f(y)| of consecutive samples.
 
     Source: ZeST-NeRF eq. 18.
@@ -96,7 +108,9 @@ def spatial_smoothness_loss(flow, points, *, valid=None, weighting="distance", d
     return mean_over_valid("spatial_smoothness_loss", residual, norm="absolute", valid=valid)
 
 
-def temporal_loss(flow_forward, flow_backward, *, valid=None, drop_far=0.0):
+def temporal_loss(
+    flow_forward: Array, flow_backward: Array, *, valid: Array | None = None, drop_far: float = 0.0
+) -> jax.Array:
     """Constant velocity: (f_forward + f_backward)^2.
 
     Source: ZeST-NeRF eq. 19.

@@ -4,13 +4,15 @@ D        depth planes of a volume
 valid    in [0, 1]; 0 where there is no answer
 """
 
+import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
+from zestjax.base.types import Array
 from zestjax.losses.means import mean_over_valid, spread_mask
 
 
-def depth_cross_entropy_loss(log_probability, plane, *, valid=None):
+def depth_cross_entropy_loss(log_probability: Array, plane: Array, *, valid: Array | None = None) -> jax.Array:
     """Cross-entropy of a distribution over depth planes against the true depth.
 
     The true depth lies between two planes and is shared between them linearly.
@@ -39,7 +41,9 @@ def depth_cross_entropy_loss(log_probability, plane, *, valid=None):
     return mean_over_valid("depth_cross_entropy_loss", cost, valid=inside)
 
 
-def motion_mask_loss(dynamicness, moving, *, valid=None, floor=1e-3):
+def motion_mask_loss(
+    dynamicness: Array, moving: Array, *, valid: Array | None = None, floor: float = 1e-3
+) -> jax.Array:
     """Binary cross-entropy of the dynamic field's share of a pixel against whether the pixel moves.
 
     Args:
@@ -62,7 +66,7 @@ def motion_mask_loss(dynamicness, moving, *, valid=None, floor=1e-3):
     return mean_over_valid("motion_mask_loss", cost, valid=valid)
 
 
-def scene_flow_loss(flow, target, *, valid=None):
+def scene_flow_loss(flow: Array, target: Array, *, valid: Array | None = None) -> jax.Array:
     """Mean absolute error of the scene flow of points (or of rays), world units.
 
     Args:

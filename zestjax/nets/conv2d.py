@@ -20,7 +20,7 @@ DOUBLED = np.zeros((3, 2, 3))
 DOUBLED[0, 0, 0] = DOUBLED[1, 0, 1] = DOUBLED[1, 0, 2] = DOUBLED[1, 1, 0] = DOUBLED[1, 1, 1] = DOUBLED[2, 1, 2] = 1
 
 
-def convolve2d(x, kernel, stride):
+def convolve2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     """x (B, H, W, in), kernel (size, size, in, out), size odd -> (B, ceil(H / stride), ceil(W / stride), out).
 
     Output pixel j is centred on input pixel `stride` j; zero outside. `stride` is 1 or 2.
@@ -28,7 +28,7 @@ def convolve2d(x, kernel, stride):
     return (_convolve if jax.default_backend() == "cpu" else _convolve_plain)(x, kernel, stride)
 
 
-def doubled_convolve2d(x, kernel):
+def doubled_convolve2d(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """Convolution after doubling every pixel: x (B, H, W, in), kernel (3, 3, in, out) -> (B, 2 H, 2 W, out)."""
     return (_doubled if jax.default_backend() == "cpu" else _doubled_plain)(x, kernel)
 

@@ -25,7 +25,7 @@ PARITY = np.zeros((2, 2, 3))
 PARITY[0, 0, 1] = PARITY[0, 1, 2] = PARITY[1, 1, 0] = 1
 
 
-def conv3d(x, kernel, *, stride=1, lowering="auto"):
+def conv3d(x: jax.Array, kernel: jax.Array, *, stride: int = 1, lowering: str = "auto") -> jax.Array:
     """Zero-padded convolution x (D, H, W, in) -> (ceil(D / stride), ceil(H / stride), ceil(W / stride), out).
 
     Args:
@@ -44,7 +44,7 @@ def conv3d(x, kernel, *, stride=1, lowering="auto"):
     return lax.conv_general_dilated(x[None], kernel, (stride,) * 3, [(1, 1)] * 3, dimension_numbers=VOLUMES)[0]
 
 
-def conv3d_transpose(x, kernel, *, lowering="auto"):
+def conv3d_transpose(x: jax.Array, kernel: jax.Array, *, lowering: str = "auto") -> jax.Array:
     """Transposed convolution of stride 2: x (D, H, W, in) -> (2 D, 2 H, 2 W, out).
 
     On each axis, input cell j adds x[j] kernel[i] to output cell 2 j + i - 1: published kernels need their axes

@@ -1,5 +1,6 @@
 """The 3-D U-Net that turns a cost volume into an encoding volume."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -26,7 +27,9 @@ class CostRegulariser(NamedTuple):
     head: Dense | None
 
 
-def init_cost_regulariser(key, n_in, *, widths=(8, 16, 32, 64), n_out=None):
+def init_cost_regulariser(
+    key: jax.Array, n_in: int, *, widths: Sequence[int] = (8, 16, 32, 64), n_out: int | None = None
+) -> CostRegulariser:
     """Parameters of `cost_regulariser`.
 
     Args:
@@ -47,7 +50,9 @@ def init_cost_regulariser(key, n_in, *, widths=(8, 16, 32, 64), n_out=None):
     return CostRegulariser(init_block3d(keys[-2], n_in, widths[0]), downs, ups, head)
 
 
-def cost_regulariser(params, volume, *, lowering="auto", legacy_abs=False):
+def cost_regulariser(
+    params: CostRegulariser, volume: jax.Array, *, lowering: str = "auto", legacy_abs: bool = False
+) -> jax.Array:
     """Encoding volume of a cost volume: down, up, and added skips.
 
     Sizes that the levels do not divide are padded with their last cells and cropped again.

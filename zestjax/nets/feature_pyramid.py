@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_option, check_shapes
+from zestjax.base.types import Array
 from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d, raised
 
 STRIDES = (1, 1, 2, 1, 1, 2, 1, 1)
@@ -25,7 +26,9 @@ class FeaturePyramid(NamedTuple):
     head: Conv
 
 
-def init_feature_pyramid(key, *, widths=(8, 16, 32), n_in=3):
+def init_feature_pyramid(
+    key: jax.Array, *, widths: tuple[int, int, int] = (8, 16, 32), n_in: int = 3
+) -> FeaturePyramid:
     """Parameters of `feature_pyramid`.
 
     Args:
@@ -40,14 +43,16 @@ def init_feature_pyramid(key, *, widths=(8, 16, 32), n_in=3):
     return FeaturePyramid(tuple(blocks), init_conv2d(keys[8], 1, quarter, quarter))
 
 
-def imagenet_normalised(images):
+def imagenet_normalised(images: jax.Array) -> jax.Array:
     """Images (..., 3) in [0, 1], centred and scaled by ImageNet's statistics."""
     shape = (1,) * (images.ndim - 1) + (3,)
     mean, deviation = (jnp.asarray(v, images.dtype).reshape(shape) for v in (IMAGENET_MEAN, IMAGENET_DEVIATION))
     return (images - mean) / deviation
 
 
-def feature_pyramid(params, images, *, normalise="imagenet", legacy_abs=False):
+def feature_pyramid(
+    params: FeaturePyramid, images: Array, *, normalise: str | None = "imagenet", legacy_abs: bool = False
+) -> jax.Array:
     """Features of every view at a quarter of its size; feature pixel j sits on image pixel 4 j.
 
     The norms see all views as one batch, so a view's features depend on the views it comes with.
@@ -70,6 +75,7 @@ def feature_pyramid(params, images, *, normalise="imagenet", legacy_abs=False):
     """
     check_option("feature_pyramid", normalise=(normalise, ("imagenet", None)))
     check_shapes("feature_pyramid", kernel=(params.blocks[0].conv.kernel, "3 3 C wide"), images=(images, "V H W C"))
+    images = jnp.asarray(images)
     x = imagenet_normalised(images) if normalise == "imagenet" else images
     for block, stride in zip(params.blocks, STRIDES, strict=True):
         x = block2d(block, x, stride=stride, legacy_abs=legacy_abs)

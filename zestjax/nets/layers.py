@@ -89,54 +89,54 @@ def _normal(key, shape):
     return jax.random.normal(key, (math.prod(shape),)).reshape(shape)
 
 
-def init_dense(key, n_in, n_out, *, scale=1.0):
+def init_dense(key: jax.Array, n_in: int, n_out: int, *, scale: float = 1.0) -> Dense:
     """A `Dense` with normal kernel of variance 2 scale^2 / n_in (He) and bias 0."""
     return Dense(jax.random.normal(key, (n_in, n_out)) * (scale * (2 / n_in) ** 0.5), jnp.zeros(n_out))
 
 
-def init_conv2d(key, size, n_in, n_out, *, bias=True):
+def init_conv2d(key: jax.Array, size: int, n_in: int, n_out: int, *, bias: bool = True) -> Conv:
     """A 2-D `Conv` of odd `size` with normal kernel of variance 2 / (size^2 n_in); bias 0, or None."""
     kernel = _normal(key, (size, size, n_in, n_out)) * (2 / (size**2 * n_in)) ** 0.5
     return Conv(kernel, jnp.zeros(n_out) if bias else None)
 
 
-def init_conv3d(key, n_in, n_out):
+def init_conv3d(key: jax.Array, n_in: int, n_out: int) -> Conv:
     """A 3-D `Conv` of size 3 without bias; normal kernel of variance 2 / (27 n_in)."""
     return Conv(_normal(key, (3, 3, 3, n_in, n_out)) * (2 / (27 * n_in)) ** 0.5, None)
 
 
-def init_norm(channels):
+def init_norm(channels: int) -> Norm:
     """A `Norm` of scale 1 and offset 0."""
     return Norm(jnp.ones(channels), jnp.zeros(channels))
 
 
-def init_block2d(key, size, n_in, n_out):
+def init_block2d(key: jax.Array, size: int, n_in: int, n_out: int) -> Block:
     """A 2-D `Block`."""
     return Block(init_conv2d(key, size, n_in, n_out, bias=False), init_norm(n_out))
 
 
-def init_block3d(key, n_in, n_out):
+def init_block3d(key: jax.Array, n_in: int, n_out: int) -> Block:
     """A 3-D `Block` of size 3."""
     return Block(init_conv3d(key, n_in, n_out), init_norm(n_out))
 
 
-def lowered(x, kernel):
+def lowered(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """x in the kernel's precision where that is a half one; as it is beside any other."""
     return x.astype(kernel.dtype) if jnp.finfo(kernel.dtype).bits < 32 else x
 
 
-def raised(x):
+def raised(x: jax.Array) -> jax.Array:
     """x in float32 where it is of a half precision: what leaves a network."""
     return x.astype(jnp.float32) if jnp.finfo(x.dtype).bits < 32 else x
 
 
-def add_bias(x, bias):
+def add_bias(x: jax.Array, bias: jax.Array) -> jax.Array:
     """x (..., C) + bias (C,), written as a product with ones so that the gradient's sum is a matrix product too."""
     ones = jnp.ones((x.size // x.shape[-1], 1), x.dtype)
     return x + (ones @ bias[None]).reshape(x.shape)
 
 
-def dense(params, x):
+def dense(params: Dense, x: jax.Array) -> jax.Array:
     """x (..., in) @ kernel + bias -> (..., out).
 
     Raises:
@@ -146,7 +146,7 @@ def dense(params, x):
     return add_bias(lowered(x, params.kernel) @ params.kernel, params.bias)
 
 
-def conv2d(params, x, *, stride=1):
+def conv2d(params: Conv, x: jax.Array, *, stride: int = 1) -> jax.Array:
     """Zero-padded convolution x (B, H, W, in) -> (B, ceil(H / stride), ceil(W / stride), out).
 
     Output pixel j sits on input pixel `stride` j, whatever the (odd) kernel size.
@@ -169,7 +169,15 @@ def conv2d(params, x, *, stride=1):
     return out if params.bias is None else add_bias(out, params.bias)
 
 
-def norm_act(params, x, *, slope=0.01, over="batch", epsilon=1e-5, legacy_abs=False):
+def norm_act(
+    params: Norm,
+    x: jax.Array,
+    *,
+    slope: float = 0.01,
+    over: str = "batch",
+    epsilon: float = 1e-5,
+    legacy_abs: bool = False,
+) -> jax.Array:
     """Standardise each channel by its batch's statistics, scale and offset, leaky ReLU; x (..., C) -> (..., C).
 
     Mean and biased variance are centred, in two passes.
@@ -240,6 +248,8 @@ _norm_act = jax.custom_vjp(_standardise, nondiff_argnums=(0, 1))
 _norm_act.defvjp(_norm_act_fwd, _norm_act_bwd)
 
 
-def block2d(params, x, *, stride=1, over="batch", legacy_abs=False):
+def block2d(
+    params: Block, x: jax.Array, *, stride: int = 1, over: str = "batch", legacy_abs: bool = False
+) -> jax.Array:
     """`conv2d`, then `norm_act`."""
     return norm_act(params.norm, conv2d(params.conv, x, stride=stride), over=over, legacy_abs=legacy_abs)

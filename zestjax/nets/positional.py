@@ -1,12 +1,13 @@
 """Sines and cosines of a coordinate at octave frequencies."""
 
+import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_option
 from zestjax.nets.layers import raised
 
 
-def positional_encoding(x, *, levels, order="frequency_major"):
+def positional_encoding(x: jax.Array, *, levels: int, order: str = "frequency_major") -> jax.Array:
     """x (..., P) -> (..., P (1 + 2 levels)): x itself, then sin and cos of 2^k x for k = 0 .. levels - 1.
 
     Scaling by 2^k is exact, so the highest level is as accurate as the sine itself. Lower precisions than float32

@@ -1,6 +1,7 @@
 """A small 2-D U-Net."""
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -32,7 +33,7 @@ class UNet2d(NamedTuple):
     head: Conv
 
 
-def init_unet2d(key, n_in, widths, n_out):
+def init_unet2d(key: jax.Array, n_in: int, widths: Sequence[int], n_out: int) -> UNet2d:
     """Parameters of `unet2d`.
 
     Args:
@@ -51,7 +52,7 @@ def init_unet2d(key, n_in, widths, n_out):
     return UNet2d(block(1, n_in, wide), block(3, wide, wide), downs, ups, block(3, wide, wide), head)
 
 
-def unet2d(params, x):
+def unet2d(params: UNet2d, x: jax.Array) -> jax.Array:
     """x (B, h, w, n_in) -> (B, h, w, n_out), any size; each image by itself.
 
     Strided convolutions down; nearest upsampling, a convolution and an added skip up; the last layer is linear. Each

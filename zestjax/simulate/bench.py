@@ -41,7 +41,7 @@ class _Recipe:
     room: dict = field(default_factory=dict)
 
 
-def bench_scene(name, *, height=144, width=256):
+def bench_scene(name: str, *, height: int = 144, width: int = 256) -> SimulatedScene:
     """One scene of zest-bench.
 
     Args:

@@ -7,21 +7,25 @@ the rays; stacked in one array, it is three times slower.
     R        any ray axes
 """
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-NOTHING = jnp.inf
+from zestjax.base.types import Array, Scalar
+
+NOTHING = jnp.inf  # the distance of a ray that meets nothing: further than all that it could meet
+Vector = Sequence[Array] | Array  # (x, y, z), see above; or an array's row of three
 
 
 class Placed(NamedTuple):
     """Bodies at one time: `unit_from_world` (B, 4, 4), `present` (B,) bool, `hollow` (B,) bool."""
 
-    unit_from_world: jax.Array
-    present: jax.Array
-    hollow: jax.Array
+    unit_from_world: Array
+    present: Array
+    hollow: Array
 
 
 class Hit(NamedTuple):
@@ -31,12 +35,12 @@ class Hit(NamedTuple):
     body: jax.Array
 
 
-def dot(a, b):
+def dot(a: Vector, b: Vector) -> Array:
     """Inner product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def along(origin, distance, direction):
+def along(origin: Vector, distance: Scalar, direction: Vector) -> tuple[jax.Array, ...]:
     """The point `origin + distance * direction`."""
     return tuple(o + distance * d for o, d in zip(origin, direction, strict=True))
 
@@ -77,7 +81,7 @@ def _folded(placed, origin, direction, boxes, step, start):
     return start
 
 
-def nearest_hit(placed, origin, direction, *, boxes, start=1e-3):
+def nearest_hit(placed: Placed, origin: Vector, direction: Vector, *, boxes: int, start: float = 1e-3) -> Hit:
     """The first body along each ray.
 
     Args:
@@ -101,7 +105,7 @@ def nearest_hit(placed, origin, direction, *, boxes, start=1e-3):
     return _folded(placed, origin, direction, boxes, step, missed)
 
 
-def blocked(placed, origin, direction, *, boxes):
+def blocked(placed: Placed, origin: Vector, direction: Vector, *, boxes: int) -> jax.Array:
     """(R) bool: does a body that is not hollow stand between `origin` and `origin + direction`?"""
 
     def step(found, crossing, body):

@@ -11,10 +11,14 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.numerics import safe_divide
+from zestjax.base.types import Scalar
+from zestjax.cameras import Camera
 from zestjax.resample import bilinear
 from zestjax.simulate.clips import take_camera, without_noise
 from zestjax.simulate.render import render
 from zestjax.simulate.truth import correspond
+from zestjax.simulate.types import SimulatedScene
+from zestjax.video import Video
 
 
 class Ceiling(NamedTuple):
@@ -26,7 +30,7 @@ class Ceiling(NamedTuple):
     unseen: jax.Array
 
 
-def ceiling(simulated, video, camera, time, *, window=7):
+def ceiling(simulated: SimulatedScene, video: Video, camera: Camera, time: Scalar, *, window: int = 7) -> Ceiling:
     """The mean of the inputs at every pixel's true surface point, moved to their times by the true motion.
 
     Args:

@@ -5,6 +5,7 @@ T        targets
 H W      rows and columns
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -12,11 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera
 from zestjax.simulate.motion import all_bodies
-from zestjax.simulate.random import generator, random_scene
+from zestjax.simulate.random import RandomScene, generator, random_scene
 from zestjax.simulate.render import render, with_noise
 from zestjax.simulate.truth import motion_mask, moving_bodies, scene_flow, without_movers
+from zestjax.simulate.types import Scene
 
 
 class Clip(NamedTuple):
@@ -31,38 +34,40 @@ class Clip(NamedTuple):
     target_intrinsics: (T, 3, 3). target_camera_from_world: (T, 4, 4). target_time: (T,) int32.
     """
 
-    images: np.ndarray
-    depth: np.ndarray
-    moving: np.ndarray
-    intrinsics: np.ndarray
-    camera_from_world: np.ndarray
+    images: Array
+    depth: Array
+    moving: Array
+    intrinsics: Array
+    camera_from_world: Array
     near: np.floating
     far: np.floating
-    target_images: np.ndarray
-    target_depth: np.ndarray
-    target_moving: np.ndarray
-    target_scene_flow: np.ndarray
-    target_static_images: np.ndarray
-    target_static_depth: np.ndarray
-    target_static_valid: np.ndarray
-    target_intrinsics: np.ndarray
-    target_camera_from_world: np.ndarray
-    target_time: np.ndarray
+    target_images: Array
+    target_depth: Array
+    target_moving: Array
+    target_scene_flow: Array
+    target_static_images: Array
+    target_static_depth: Array
+    target_static_valid: Array
+    target_intrinsics: Array
+    target_camera_from_world: Array
+    target_time: Array
 
 
 class Shot(NamedTuple):
     """One view with its answers: image (H, W, 3) uint8, depth (H, W), moving (H, W) bool, still (H, W) bool (the body
     never moves), flow (2, H, W, 3) float16 world displacement to the next and to the previous time."""
 
-    image: jax.Array
-    depth: jax.Array
-    moving: jax.Array
-    still: jax.Array
-    flow: jax.Array
+    image: Array
+    depth: Array
+    moving: Array
+    still: Array
+    flow: Array
 
 
 @partial(jax.jit, static_argnames=("height", "width", "samples"))
-def shot(key, scene, camera, time, *, height, width, samples=2):
+def shot(
+    key: jax.Array, scene: Scene, camera: Camera, time: Scalar, *, height: int, width: int, samples: int = 2
+) -> Shot:
     """`Shot` of a scene by one camera at a time; `key` draws the sensor's noise."""
     frame = render(scene, camera, time, height=height, width=width, samples=samples)
     still = ~moving_bodies(all_bodies(scene))[jnp.maximum(frame.body, 0)]
@@ -71,18 +76,20 @@ def shot(key, scene, camera, time, *, height, width, samples=2):
     return Shot(image, frame.depth, motion_mask(scene, frame, time), still, flow.astype(jnp.float16))
 
 
-def without_noise(scene):
+def without_noise(scene: Scene) -> Scene:
     """The scene with the sensor's noise at 0, in the same program."""
     noise = scene.effects.noise
     return scene._replace(effects=scene.effects._replace(noise=None if noise is None else jnp.zeros_like(noise)))
 
 
-def take_camera(cameras, index):
+def take_camera(cameras: Camera, index: int | Array) -> Camera:
     """One `Camera` of a batch."""
     return Camera(*(jnp.asarray(leaf[index]) for leaf in cameras))
 
 
-def shots(key, scene, cameras, times, *, height, width):
+def shots(
+    key: jax.Array, scene: Scene, cameras: Camera, times: Sequence[float] | Array, *, height: int, width: int
+) -> Shot:
     """`Shot` of host arrays with a leading axis: each camera at its time. All are dispatched before any is awaited."""
     keys = jax.random.split(key, len(times))
     taken = [
@@ -92,7 +99,9 @@ def shots(key, scene, cameras, times, *, height, width):
     return jax.tree.map(lambda *rows: np.stack([np.asarray(row) for row in rows]), *taken)
 
 
-def clip(key, drawn, *, height, width, slack=(0.0, 0.0)):
+def clip(
+    key: jax.Array, drawn: RandomScene, *, height: int, width: int, slack: Sequence[float] | np.ndarray = (0.0, 0.0)
+) -> Clip:
     """The `Clip` of a drawn scene.
 
     Args:
@@ -122,7 +131,7 @@ def clip(key, drawn, *, height, width, slack=(0.0, 0.0)):
     )  # fmt: skip
 
 
-def training_clip(key, *, height=144, width=256, frames=16, targets=8):
+def training_clip(key: jax.Array, *, height: int = 144, width: int = 256, frames: int = 16, targets: int = 8) -> Clip:
     """A clip of a random scene.
 
     Args:

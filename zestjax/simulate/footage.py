@@ -5,6 +5,7 @@ T        targets
 H W      rows and columns
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -12,11 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.types import Array
 from zestjax.cameras import Camera
 from zestjax.simulate.bench import bench_scene
 from zestjax.simulate.clips import shots, take_camera, without_noise
 from zestjax.simulate.render import seen_surface
 from zestjax.simulate.truth import correspond
+from zestjax.simulate.types import SimulatedScene
 from zestjax.video import Video
 
 
@@ -30,17 +33,17 @@ class Answers(NamedTuple):
     cameras: (T,) `Camera`. times: (T,) int.
     """
 
-    images: np.ndarray
-    depth: np.ndarray
-    moving: np.ndarray
-    scene_flow: np.ndarray
-    flow: np.ndarray
-    visible: np.ndarray
+    images: Array
+    depth: Array
+    moving: Array
+    scene_flow: Array
+    flow: Array
+    visible: Array
     cameras: Camera
-    times: np.ndarray
+    times: Array
 
 
-def input_video(simulated, *, noise=None):
+def input_video(simulated: SimulatedScene, *, noise: jax.Array | None = None) -> Video:
     """The `Video` a user would have: frame i by camera `taken[i]`, with the sensor's noise (drawn from the JAX
     key `noise`)."""
     key = jax.random.key(0) if noise is None else noise
@@ -52,7 +55,9 @@ def input_video(simulated, *, noise=None):
     return Video(images, jax.tree.map(jnp.asarray, cameras), *bounds)
 
 
-def answers(simulated, times, cameras):
+def answers(
+    simulated: SimulatedScene, times: Sequence[int] | np.ndarray, cameras: Sequence[int] | np.ndarray | Camera
+) -> Answers:
     """Views and the truth behind them.
 
     Args:
@@ -96,16 +101,23 @@ def _link(scene, simulated, camera, time, step, size):
     return link if exists else link._replace(visible=jnp.zeros_like(link.visible))
 
 
-def held_out(simulated, time):
+def held_out(simulated: SimulatedScene, time: int) -> np.ndarray:
     """Indices of the rig's cameras that did not take the frame of a time."""
     return np.setdiff1d(np.arange(len(simulated.rig.intrinsics)), simulated.taken[time])
 
 
-def bench_video(name, *, height=144, width=256):
+def bench_video(name: str, *, height: int = 144, width: int = 256) -> Video:
     """Input `Video` of a scene of zest-bench; see `bench_scene`."""
     return input_video(bench_scene(name, height=height, width=width))
 
 
-def bench_targets(name, times, cameras, *, height=144, width=256):
+def bench_targets(
+    name: str,
+    times: Sequence[int] | np.ndarray,
+    cameras: Sequence[int] | np.ndarray,
+    *,
+    height: int = 144,
+    width: int = 256,
+) -> Answers:
     """`Answers` of held-out views of a scene of zest-bench: (T,) times and (T,) cameras of the rig."""
     return answers(bench_scene(name, height=height, width=width), times, cameras)

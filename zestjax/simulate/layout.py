@@ -5,11 +5,12 @@ scene's units. A `Layout` collects bodies and pads them to fixed counts, so that
 size runs in one compiled program.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zestjax.simulate.types import Bodies, Motion, Scene
+from zestjax.simulate.types import Bodies, Effects, Motion, Scene
 
 BOXES, BALLS = 20, 10
 
@@ -36,7 +37,7 @@ class Body(NamedTuple):
     phase: float = 0.0
 
 
-def affine(*, linear=None, offset=(0, 0, 0)):
+def affine(*, linear: np.ndarray | None = None, offset: Sequence[float] | np.ndarray = (0, 0, 0)) -> np.ndarray:
     """(4, 4) float32 matrix."""
     matrix = np.eye(4, dtype=np.float32)
     matrix[:3, :3] = np.eye(3) if linear is None else linear
@@ -44,13 +45,13 @@ def affine(*, linear=None, offset=(0, 0, 0)):
     return matrix
 
 
-def turned(angle):
+def turned(angle: float) -> np.ndarray:
     """(3, 3) rotation about the vertical axis."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]], np.float32)
 
 
-def sized(half, *, offset=(0, 0, 0)):
+def sized(half: Sequence[float] | np.ndarray, *, offset: Sequence[float] | np.ndarray = (0, 0, 0)) -> np.ndarray:
     """Shape of a body of half-lengths `half` whose middle is at `offset` in its joint."""
     return affine(linear=np.diag(np.asarray(half, np.float32)), offset=offset)
 
@@ -64,15 +65,15 @@ class Layout:
     def __init__(self):
         self._boxes, self._balls = [], []
 
-    def box(self, **fields):
+    def box(self, **fields: Any) -> tuple[str, int]:
         """Add a box; the fields are `Body`'s."""
         return self._add(self._boxes, "box", fields)
 
-    def ball(self, **fields):
+    def ball(self, **fields: Any) -> tuple[str, int]:
         """Add a ball or an ellipsoid; the fields are `Body`'s."""
         return self._add(self._balls, "ball", fields)
 
-    def room_for(self, *, boxes=0, balls=0):
+    def room_for(self, *, boxes: int = 0, balls: int = 0) -> bool:
         """Would so many more bodies fit?"""
         return len(self._boxes) + boxes <= BOXES and len(self._balls) + balls <= BALLS
 
@@ -81,7 +82,18 @@ class Layout:
         bodies.append(Body(**fields))
         return kind, len(bodies) - 1
 
-    def scene(self, *, atlas, light, ambient, effects, boxes=BOXES, balls=BALLS, mid_time=0.0, unit=1.0):
+    def scene(
+        self,
+        *,
+        atlas: np.ndarray,
+        light: Sequence[float] | np.ndarray,
+        ambient: float,
+        effects: Effects,
+        boxes: int = BOXES,
+        balls: int = BALLS,
+        mid_time: float = 0.0,
+        unit: float = 1.0,
+    ) -> Scene:
         """The `Scene`.
 
         Args:

@@ -8,16 +8,18 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.numerics import matmul, matvec
+from zestjax.base.types import Array, Scalar
+from zestjax.simulate.types import Bodies, Scene
 
 CHAIN = 4  # the longest chain of parents
 
 
-def all_bodies(scene):
+def all_bodies(scene: Scene) -> Bodies:
     """`Bodies` of the whole scene, boxes first, then balls."""
     return jax.tree.map(lambda box, ball: jnp.concatenate([box, ball]), scene.boxes, scene.balls)
 
 
-def rotation_from_vector(vector):
+def rotation_from_vector(vector: Array) -> jax.Array:
     """(..., 3, 3) rotations by (..., 3) axis-angle vectors (Rodrigues); exact and differentiable at 0."""
     squared = jnp.sum(vector * vector, axis=-1)
     small = squared < 1e-12
@@ -38,7 +40,7 @@ def _affine(linear, offset):
     return jnp.concatenate([top, last], axis=-2)
 
 
-def world_from_bodies(bodies, time):
+def world_from_bodies(bodies: Bodies, time: Scalar) -> jax.Array:
     """Where the unit bodies are.
 
     Args:
@@ -61,7 +63,7 @@ def world_from_bodies(bodies, time):
     return matmul(matmul(joints, _affine(stretch, jnp.zeros_like(offset))), shape)
 
 
-def affine_inverse(transform):
+def affine_inverse(transform: Array) -> jax.Array:
     """Inverse of (..., 4, 4) affine transforms by cofactors; the linear part must not be singular."""
     a, b, c = (transform[..., :3, i] for i in range(3))
     rows = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-2)
@@ -69,13 +71,13 @@ def affine_inverse(transform):
     return _affine(linear, -matvec(linear, transform[..., :3, 3]))
 
 
-def carried(points, body, there_from_here):
+def carried(points: Array, body: Array, there_from_here: Array) -> jax.Array:
     """Material points (..., 3) on bodies (...) int32, moved by (B, 4, 4) world_from_world; -1 stays put."""
     moved = jnp.take(there_from_here, jnp.maximum(body, 0), axis=0)
     return jnp.where((body < 0)[..., None], points, matvec(moved[..., :3, :3], points) + moved[..., :3, 3])
 
 
-def movement(bodies, time_from, time_to):
+def movement(bodies: Bodies, time_from: Scalar, time_to: Scalar) -> jax.Array:
     """(B, 4, 4) taking each body's material points from one time to another, world to world."""
     here, there = world_from_bodies(bodies, time_from), world_from_bodies(bodies, time_to)
     return matmul(there, affine_inverse(here))

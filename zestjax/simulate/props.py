@@ -4,11 +4,11 @@ z        distance from the rig, layout units; what stands nearest is at about 1
 reach    of a `View`: distance of the back wall
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from zestjax.simulate.layout import sized
+from zestjax.simulate.layout import Layout, sized
 from zestjax.simulate.textures import SLOTS
 
 
@@ -21,21 +21,21 @@ class View(NamedTuple):
     floor: float
     reach: float
 
-    def at(self, x, y, z):
+    def at(self, x: float, y: float, z: float) -> tuple[float, float, float]:
         """Position at image fractions x, y in [-1, 1] and distance z."""
         return x * self.across * z, y * self.down * z, z
 
-    def width(self, z):
+    def width(self, z: float) -> float:
         """Width of the view at a distance."""
         return 2 * self.across * z
 
 
-def log_uniform(chance, low, high):
+def log_uniform(chance: np.random.Generator, low: float, high: float) -> float:
     """A number whose logarithm is uniform."""
     return float(np.exp(chance.uniform(np.log(low), np.log(max(high, low * 1.001)))))
 
 
-def finish(chance, view, z, size):
+def finish(chance: np.random.Generator, view: View, z: float, size: float) -> dict[str, Any]:
     """Random textures, tile length, tint and gloss of a thing of half-length `size` at distance z."""
     tile = log_uniform(chance, 1.2 * size, max(2.4 * size, 0.8 * view.width(z)))
     tint = chance.uniform(0.65, 1.1) * chance.uniform(0.85, 1.1, 3)
@@ -45,7 +45,16 @@ def finish(chance, view, z, size):
     )
 
 
-def add_room(layout, chance, view, *, half_width, ceiling, behind, **motion):
+def add_room(
+    layout: Layout,
+    chance: np.random.Generator,
+    view: View,
+    *,
+    half_width: float,
+    ceiling: float,
+    behind: float,
+    **motion: Any,
+) -> None:
     """The hollow box around everything, and its floor."""
     depth = (view.reach + behind) / 2
     height = (view.floor + ceiling) / 2
@@ -64,7 +73,16 @@ def add_room(layout, chance, view, *, half_width, ceiling, behind, **motion):
     )  # fmt: skip
 
 
-def add_standing(layout, chance, view, *, z, x, kind, motion=None):
+def add_standing(
+    layout: Layout,
+    chance: np.random.Generator,
+    view: View,
+    *,
+    z: float,
+    x: float,
+    kind: str,
+    motion: dict[str, Any] | None = None,
+) -> None:
     """Something still: "block", "ball", "pole", "panel", "beam", "tower" (a large block) or "hanging" (a
     ball or a block in mid-air)."""
     motion = motion or {}
@@ -89,7 +107,18 @@ def add_standing(layout, chance, view, *, z, x, kind, motion=None):
     add(shape=sized(half), position=(x * view.across * z, y, z), turn=turn, **look, **motion)
 
 
-def add_roller(layout, chance, view, *, z, x, size, speed, heading, gloss=None):
+def add_roller(
+    layout: Layout,
+    chance: np.random.Generator,
+    view: View,
+    *,
+    z: float,
+    x: float,
+    size: float,
+    speed: float,
+    heading: float,
+    gloss: float | None = None,
+) -> None:
     """A ball that rolls over the floor; `speed` per frame along `heading` (0 is away, pi/2 is to the right)."""
     look = finish(chance, view, z, size)
     look |= {} if gloss is None else {"gloss": gloss}
@@ -99,7 +128,20 @@ def add_roller(layout, chance, view, *, z, x, size, speed, heading, gloss=None):
     )  # fmt: skip
 
 
-def add_slider(layout, chance, view, *, z, x, y, size, speed, heading, spin=0.0, kind="box"):
+def add_slider(
+    layout: Layout,
+    chance: np.random.Generator,
+    view: View,
+    *,
+    z: float,
+    x: float,
+    y: float | None,
+    size: float,
+    speed: float,
+    heading: float,
+    spin: float = 0.0,
+    kind: str = "box",
+) -> None:
     """A block or ellipsoid that moves through the air or, with y None, over the floor, and may spin upright."""
     half = size * chance.uniform(0.6, 1.3, 3)
     height = view.floor - half[1] if y is None else y * view.down * z
@@ -112,7 +154,20 @@ def add_slider(layout, chance, view, *, z, x, y, size, speed, heading, spin=0.0,
     )  # fmt: skip
 
 
-def add_blob(layout, chance, view, *, z, x, y, size, speed, heading, amount, rate):
+def add_blob(
+    layout: Layout,
+    chance: np.random.Generator,
+    view: View,
+    *,
+    z: float,
+    x: float,
+    y: float,
+    size: float,
+    speed: float,
+    heading: float,
+    amount: float,
+    rate: float,
+) -> None:
     """An ellipsoid that stretches and shears by `amount` while it drifts."""
     raw = chance.normal(0, 1, (3, 3))
     strain = amount * (raw + 0.6 * raw.T) / np.abs(raw + 0.6 * raw.T).max()
@@ -122,7 +177,18 @@ def add_blob(layout, chance, view, *, z, x, y, size, speed, heading, amount, rat
     )  # fmt: skip
 
 
-def add_walker(layout, chance, view, *, z, x, size, speed, heading, rate):
+def add_walker(
+    layout: Layout,
+    chance: np.random.Generator,
+    view: View,
+    *,
+    z: float,
+    x: float,
+    size: float,
+    speed: float,
+    heading: float,
+    rate: float,
+) -> None:
     """A figure of half-height `size` whose arms and two-part legs swing from its trunk: chains of three."""
     looks = [finish(chance, view, z, 0.5 * size) for _ in range(3)]
     gait = dict(rate=rate, phase=chance.uniform(0, 6.3))
@@ -152,7 +218,17 @@ def add_walker(layout, chance, view, *, z, x, size, speed, heading, rate):
         )  # fmt: skip
 
 
-def add_pendulum(layout, chance, view, *, z, x, size, swing, rate):
+def add_pendulum(
+    layout: Layout,
+    chance: np.random.Generator,
+    view: View,
+    *,
+    z: float,
+    x: float,
+    size: float,
+    swing: float,
+    rate: float,
+) -> None:
     """A weight on a thin rod that swings from above the picture."""
     top, length = -1.1 * view.down * z, chance.uniform(0.8, 1.4) * view.down * z
     gait = dict(rate=rate, phase=chance.uniform(0, 6.3))

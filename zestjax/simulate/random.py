@@ -32,12 +32,12 @@ class RandomScene(NamedTuple):
     target_times: np.ndarray
 
 
-def generator(key):
+def generator(key: jax.Array) -> np.random.Generator:
     """`numpy.random.Generator` that is a function of a JAX key."""
     return np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
 
 
-def random_scene(key, *, height, width, frames=16, targets=8):
+def random_scene(key: jax.Array, *, height: int, width: int, frames: int = 16, targets: int = 8) -> RandomScene:
     """A scene with its cameras.
 
     Args:
@@ -209,6 +209,6 @@ def _add_mover(layout, chance, view, frames, speed):
         props.add_slider(layout, chance, view, **common, y=height, spin=spin, kind=shape)
 
 
-def log_size(chance):
+def log_size(chance: np.random.Generator) -> float:
     """Half-length of a mover as a share of the view's width."""
     return props.log_uniform(chance, 0.04, 0.19)

@@ -8,19 +8,22 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.numerics import matmul
-from zestjax.cameras import intrinsics_inverse, rigid_inverse
+from zestjax.base.types import Array, Scalar
+from zestjax.cameras import Camera, intrinsics_inverse, rigid_inverse
 from zestjax.simulate.cast import Placed, along, nearest_hit
 from zestjax.simulate.motion import affine_inverse, all_bodies, world_from_bodies
 from zestjax.simulate.shade import shaded
-from zestjax.simulate.types import Frame
+from zestjax.simulate.types import Bodies, Effects, Frame, Scene
 
 
-def placed_bodies(bodies, time):
+def placed_bodies(bodies: Bodies, time: Scalar) -> Placed:
     """`Placed` at a time."""
     return Placed(affine_inverse(world_from_bodies(bodies, time)), bodies.present, bodies.hollow)
 
 
-def camera_rays(camera, pixels_u, pixels_v):
+def camera_rays(
+    camera: Camera, pixels_u: Array, pixels_v: Array
+) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
     """Origin, a vector of (), and directions, a vector of (R), of pixels; z = 1 in the camera: the ray parameter
     is the depth."""
     world_from_camera = rigid_inverse(camera.camera_from_world)
@@ -34,7 +37,7 @@ def _pixel_grid(height, width, dtype):
     return u, v
 
 
-def seen_surface(scene, camera, time, *, height, width):
+def seen_surface(scene: Scene, camera: Camera, time: Scalar, *, height: int, width: int) -> Frame:
     """What a camera sees at the pixels' centres: a `Frame` whose image is black."""
     bodies = all_bodies(scene)
     u, v = _pixel_grid(height, width, camera.intrinsics.dtype)
@@ -45,7 +48,7 @@ def seen_surface(scene, camera, time, *, height, width):
     return Frame(jnp.zeros_like(point), hit.distance, hit.body, point)
 
 
-def render(scene, camera, time, *, height, width, samples=2):
+def render(scene: Scene, camera: Camera, time: Scalar, *, height: int, width: int, samples: int = 2) -> Frame:
     """What a camera sees at a time.
 
     Args:
@@ -84,7 +87,7 @@ def render(scene, camera, time, *, height, width, samples=2):
     return frame._replace(image=jnp.clip(image, 0, 1))
 
 
-def with_noise(key, image, effects):
+def with_noise(key: jax.Array, image: Array, effects: Effects) -> Array:
     """The image with the sensor's noise, in [0, 1]; unchanged where the effects have none."""
     if effects.noise is None:
         return image

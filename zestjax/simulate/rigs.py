@@ -4,6 +4,7 @@ N        cameras or frames
 width    of the view at a distance: 2 * tan(half the horizontal field of view) * distance
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,13 @@ from zestjax.cameras import Camera
 RIG = 12
 
 
-def intrinsics_from_view(height, width, tangent):
+def intrinsics_from_view(height: int, width: int, tangent: float) -> np.ndarray:
     """(3, 3) of square pixels; `tangent` of half the horizontal field of view, pixel edge to pixel edge."""
     focal = width / (2 * tangent)
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]], np.float32)
 
 
-def cameras_at(positions, angles, intrinsics, *, unit=1.0):
+def cameras_at(positions: np.ndarray, angles: np.ndarray, intrinsics: np.ndarray, *, unit: float = 1.0) -> Camera:
     """Cameras from places and small turns.
 
     Args:
@@ -46,14 +47,14 @@ def cameras_at(positions, angles, intrinsics, *, unit=1.0):
     return Camera(*leaves)
 
 
-def angles_towards(positions, target):
+def angles_towards(positions: np.ndarray, target: Sequence[float] | np.ndarray) -> np.ndarray:
     """(N, 3) yaw and pitch, no roll, that look from (N, 3) positions at one (3,) point."""
     away = np.asarray(target) - np.asarray(positions)
     yaw = np.arctan2(away[:, 0], away[:, 2])
     return np.stack([yaw, np.arctan2(away[:, 1], np.hypot(away[:, 0], away[:, 2])), np.zeros_like(yaw)], -1)
 
 
-def rig_positions(spacing, *, kind="arc", bend=0.0, count=RIG):
+def rig_positions(spacing: float, *, kind: str = "arc", bend: float = 0.0, count: int = RIG) -> np.ndarray:
     """(N, 3) places of a rig.
 
     Args:
@@ -74,16 +75,16 @@ def rig_positions(spacing, *, kind="arc", bend=0.0, count=RIG):
     return np.stack([x, y, bend * 2 * half * (x / half) ** 2], -1)
 
 
-def smooth_walk(chance, count, columns, *, waves=3):
+def smooth_walk(chance: np.random.Generator, count: int, columns: int, *, waves: int = 3) -> np.ndarray:
     """(count, columns) smooth random curves of about unit amplitude and mean 0."""
     t = np.arange(count)[:, None, None] / max(count, 2)
-    waves = chance.uniform(0.3, 2.5, (1, columns, waves))
-    curves = (np.sin(2 * np.pi * (waves * t + chance.random(waves.shape))) / waves).sum(-1)
+    rates = chance.uniform(0.3, 2.5, (1, columns, waves))
+    curves = (np.sin(2 * np.pi * (rates * t + chance.random(rates.shape))) / rates).sum(-1)
     curves = curves - curves.mean(0)
     return curves / np.maximum(np.abs(curves).max(0), 1e-6)
 
 
-def handheld_path(chance, count, step, focus):
+def handheld_path(chance: np.random.Generator, count: int, step: float, focus: float) -> tuple[np.ndarray, np.ndarray]:
     """Places and turns of a hand that drifts sideways while it shakes.
 
     Args:

@@ -8,8 +8,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.simulate.cast import along, blocked, dot
+from zestjax.base.numerics import added
+from zestjax.base.types import Array, Scalar
+from zestjax.simulate.cast import Hit, Placed, Vector, along, blocked, dot
 from zestjax.simulate.textures import LEVELS, TILE
+from zestjax.simulate.types import Bodies, Scene
 
 
 class Surface(NamedTuple):
@@ -24,13 +27,13 @@ class Surface(NamedTuple):
     distance: jax.Array
 
 
-def normalized(vector):
+def normalized(vector: Vector) -> tuple[jax.Array, ...]:
     """The vector at length 1; 0 stays 0."""
     scale = jax.lax.rsqrt(jnp.maximum(dot(vector, vector), 1e-20))
     return tuple(scale * v for v in vector)
 
 
-def surface(placed, hit, origin, direction, *, boxes):
+def surface(placed: Placed, hit: Hit, origin: Vector, direction: Vector, *, boxes: int) -> Surface:
     """`Surface` where rays meet bodies; of a ray that meets nothing, finite values without meaning."""
     body = jnp.maximum(hit.body, 0)
     distance = jnp.where(hit.body < 0, 1, hit.distance)
@@ -40,7 +43,7 @@ def surface(placed, hit, origin, direction, *, boxes):
     x, y, z = (jnp.abs(part) for part in local)
     face = jnp.where(x >= jnp.maximum(y, z), 0, jnp.where(y >= z, 1, 2)).astype(jnp.int32)
     outward = [jnp.where(body < boxes, jnp.where(face == i, jnp.sign(p), 0), p) for i, p in enumerate(local)]
-    normal = normalized(tuple(sum(matrix[i][j] * outward[i] for i in range(3)) for j in range(3)))
+    normal = normalized(tuple(dot([row[j] for row in matrix], outward) for j in range(3)))
     side = jnp.where(dot(normal, direction) > 0, -1, 1).astype(distance.dtype)
     return Surface(point, tuple(side * n for n in normal), local, face, body, distance)
 
@@ -53,7 +56,7 @@ def _texel_range(coordinate, side):
     return jnp.maximum(first, 0), jnp.minimum(first + 1, side - 1), place - low
 
 
-def texel(atlas, slot, u, v, level):
+def texel(atlas: Array, slot: Array, u: Array, v: Array, level: Array) -> tuple[jax.Array, ...]:
     """Bilinear lookup of a packed atlas.
 
     Args:
@@ -74,12 +77,13 @@ def texel(atlas, slot, u, v, level):
     left, right, across = _texel_range(u, side)
     corners = ((top, left, (1 - down) * (1 - across)), (top, right, (1 - down) * across))
     corners += ((bottom, left, down * (1 - across)), (bottom, right, down * across))
-    words = [(atlas.at[base + row * side + column].get(mode="promise_in_bounds"), w) for row, column, w in corners]
+    texels = jnp.asarray(atlas).at
+    words = [(texels[base + row * side + column].get(mode="promise_in_bounds"), w) for row, column, w in corners]
     byte = lambda word, k: (jnp.right_shift(word, jnp.uint32(8 * k)) & jnp.uint32(255)).astype(u.dtype)
-    return tuple(sum(byte(word, k) * weight for word, weight in words) / 255 for k in range(3))
+    return tuple(added(byte(word, k) * weight for word, weight in words) / 255 for k in range(3))
 
 
-def albedo(scene, bodies, seen, footprint):
+def albedo(scene: Scene, bodies: Bodies, seen: Surface, footprint: Array) -> tuple[jax.Array, ...]:
     """Texture colour. footprint: (R) world width of a sample on a surface that faces the viewer."""
     q = [seen.local[i] * bodies.tiling[:, i][seen.body] for i in range(3)]
     u = jnp.where(seen.face == 0, q[2], q[0]) + bodies.offset[:, 0][seen.body]
@@ -91,7 +95,9 @@ def albedo(scene, bodies, seen, footprint):
     return tuple(c * bodies.tint[:, i][seen.body] for i, c in enumerate(texel(scene.atlas, slot, u, v, level)))
 
 
-def shaded(scene, bodies, placed, hit, origin, direction, sample_angle):
+def shaded(
+    scene: Scene, bodies: Bodies, placed: Placed, hit: Hit, origin: Vector, direction: Vector, sample_angle: Scalar
+) -> tuple[jax.Array, ...]:
     """Colours of rays, before exposure.
 
     Args:
@@ -114,10 +120,10 @@ def shaded(scene, bodies, placed, hit, origin, direction, sample_angle):
     towards = tuple(scene.light[i] - seen.point[i] for i in range(3))
     light = normalized(towards)
     lit = jnp.maximum(dot(seen.normal, light), 0)
-    if effects.shadows is not None:
+    if (shadows := effects.shadows) is not None:
         start = along(seen.point, 2e-3 * seen.distance, seen.normal)
-        dark = lambda: 1 - effects.shadows * blocked(placed, start, towards, boxes=boxes).astype(lit.dtype)
-        lit = lit * jax.lax.cond(effects.shadows > 0, dark, lambda: jnp.ones_like(lit))
+        dark = lambda: 1 - shadows * blocked(placed, start, towards, boxes=boxes).astype(lit.dtype)
+        lit = lit * jax.lax.cond(shadows > 0, dark, lambda: jnp.ones_like(lit))
     brightness, shine = scene.ambient + (1 - scene.ambient) * lit, 0
     if effects.specular is not None:
         halfway = normalized(tuple(a + b for a, b in zip(light, backwards, strict=True)))

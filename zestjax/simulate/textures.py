@@ -25,7 +25,7 @@ PHOTOGRAPHS = {
 
 
 @cache
-def photograph(name):
+def photograph(name: str) -> np.ndarray:
     """(h, w, 3) uint8 RGB, read from the installed scikit-image.
 
     Raises:
@@ -53,7 +53,7 @@ def _crop(chance, image):
     return cv2.warpAffine(image, matrix, (TILE, TILE), flags=flags, borderMode=cv2.BORDER_REFLECT_101)
 
 
-def noise_tile(chance, *, coarsest=4, decay=0.55):
+def noise_tile(chance: np.random.Generator, *, coarsest: int = 4, decay: float = 0.55) -> np.ndarray:
     """(TILE, TILE) smooth value noise in [0, 1]: octaves of interpolated random grids."""
     total, weight, cells = np.zeros((TILE, TILE), np.float32), 1.0, coarsest
     while cells <= TILE // 2:
@@ -97,7 +97,7 @@ def _graded(chance, tile):
     return (tile - centre) * chance.uniform(0.5, 1.4) + np.clip(centre * chance.uniform(0.7, 1.3), 0.15, 0.8)
 
 
-def random_tile(chance, split):
+def random_tile(chance: np.random.Generator, split: str) -> np.ndarray:
     """One texture of a split ("training" or "bench"): (TILE, TILE, 3) uint8."""
     kind = chance.random()
     if kind < 0.68:
@@ -117,7 +117,7 @@ def random_tile(chance, split):
     return (np.clip(_graded(chance, tile), 0, 1) * 255).astype(np.uint8)
 
 
-def packed_atlas(tiles):
+def packed_atlas(tiles: np.ndarray) -> np.ndarray:
     """(T,) uint32 from (n, TILE, TILE, 3) uint8 tiles: level by level, tile by tile, row by row, as 0xBBGGRR."""
     tiles, levels = np.asarray(tiles), []
     for level in range(LEVELS):
@@ -128,6 +128,6 @@ def packed_atlas(tiles):
     return np.concatenate(levels)
 
 
-def random_atlas(chance, split, *, slots=SLOTS):
+def random_atlas(chance: np.random.Generator, split: str, *, slots: int = SLOTS) -> np.ndarray:
     """(T,) uint32 packed atlas of `slots` random textures of one split."""
     return packed_atlas(np.stack([random_tile(chance, split) for _ in range(slots)]))

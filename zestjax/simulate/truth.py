@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.numerics import matvec
-from zestjax.cameras import project
+from zestjax.base.types import Array, Scalar
+from zestjax.cameras import Camera, project
 from zestjax.simulate.cast import nearest_hit
 from zestjax.simulate.motion import all_bodies, carried, movement
 from zestjax.simulate.render import placed_bodies
+from zestjax.simulate.types import Bodies, Frame, Scene
 
 STILL = 1e-4  # a point that moves less than this share of its depth stands still
 
@@ -22,25 +24,25 @@ class Correspondence(NamedTuple):
     scene_flow: (H, W, 3) world displacement of that point. visible: (H, W) bool, view b sees the point. depth:
     (H, W) its depth in view b."""
 
-    flow: jax.Array
-    scene_flow: jax.Array
-    visible: jax.Array
-    depth: jax.Array
+    flow: Array
+    scene_flow: Array
+    visible: Array
+    depth: Array
 
 
-def scene_flow(scene, frame, time, time_there):
+def scene_flow(scene: Scene, frame: Frame, time: Scalar, time_there: Scalar) -> jax.Array:
     """(H, W, 3) world displacement of a frame's material points from its time to another."""
     return carried(frame.point, frame.body, movement(all_bodies(scene), time, time_there)) - frame.point
 
 
-def motion_mask(scene, frame, time):
+def motion_mask(scene: Scene, frame: Frame, time: Scalar) -> jax.Array:
     """(H, W) bool: does the pixel's material point move in the world between time - 1, time and time + 1?"""
     moves = [scene_flow(scene, frame, time, time + step) for step in (-1, 1)]
     distance = jnp.maximum(*(jnp.sqrt(jnp.sum(move * move, axis=-1)) for move in moves))
     return (distance > STILL * frame.depth) & (frame.body >= 0)
 
 
-def moving_bodies(bodies):
+def moving_bodies(bodies: Bodies) -> jax.Array:
     """(B,) bool: bodies that ever move, by themselves or in a chain of joints."""
     motion = bodies.motion
     parts = (motion.velocity, motion.sway, motion.spin, motion.swing, motion.strain)
@@ -51,14 +53,14 @@ def moving_bodies(bodies):
     return moves
 
 
-def without_movers(scene):
+def without_movers(scene: Scene) -> Scene:
     """The scene with everything that moves taken away, except what is around it (hollow bodies)."""
     moves, boxes = moving_bodies(all_bodies(scene)), scene.boxes.present.shape[0]
     keep = lambda bodies, moves: bodies._replace(present=bodies.present & (bodies.hollow | ~moves))
     return scene._replace(boxes=keep(scene.boxes, moves[:boxes]), balls=keep(scene.balls, moves[boxes:]))
 
 
-def seen_from(scene, camera, time, points, *, tolerance=2e-3):
+def seen_from(scene: Scene, camera: Camera, time: Scalar, points: Array, *, tolerance: float = 2e-3) -> jax.Array:
     """Does a camera see world points at a time?
 
     Args:
@@ -80,7 +82,9 @@ def seen_from(scene, camera, time, points, *, tolerance=2e-3):
     return hit.distance > 1 - tolerance
 
 
-def correspond(scene, frame, camera, time, camera_there, time_there):
+def correspond(
+    scene: Scene, frame: Frame, camera: Camera, time: Scalar, camera_there: Camera, time_there: Scalar
+) -> Correspondence:
     """From the pixels of one view to another view at another time.
 
     Args:

@@ -9,9 +9,9 @@ unit body  the box [-1, 1]^3 or the ball of radius 1
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
+from zestjax.base.types import Array
 from zestjax.cameras import Camera
 
 
@@ -29,15 +29,15 @@ class Motion(NamedTuple):
     rate, phase: (B,) radians per frame, radians.
     """
 
-    joint: jax.Array
-    parent: jax.Array
-    velocity: jax.Array
-    sway: jax.Array
-    spin: jax.Array
-    swing: jax.Array
-    strain: jax.Array
-    rate: jax.Array
-    phase: jax.Array
+    joint: Array
+    parent: Array
+    velocity: Array
+    sway: Array
+    spin: Array
+    swing: Array
+    strain: Array
+    rate: Array
+    phase: Array
 
 
 class Bodies(NamedTuple):
@@ -54,14 +54,14 @@ class Bodies(NamedTuple):
     motion: `Motion`.
     """
 
-    shape: jax.Array
-    present: jax.Array
-    hollow: jax.Array
-    texture: jax.Array
-    tiling: jax.Array
-    offset: jax.Array
-    tint: jax.Array
-    gloss: jax.Array
+    shape: Array
+    present: Array
+    hollow: Array
+    texture: Array
+    tiling: Array
+    offset: Array
+    tint: Array
+    gloss: Array
     motion: Motion
 
 
@@ -75,11 +75,11 @@ class Effects(NamedTuple):
     noise: () standard deviation of the sensor's noise, applied only where a key is given.
     """
 
-    shadows: jax.Array | None = None
-    specular: jax.Array | None = None
-    motion_blur: jax.Array | None = None
-    exposure: jax.Array | None = None
-    noise: jax.Array | None = None
+    shadows: Array | None = None
+    specular: Array | None = None
+    motion_blur: Array | None = None
+    exposure: Array | None = None
+    noise: Array | None = None
 
 
 class Scene(NamedTuple):
@@ -89,9 +89,9 @@ class Scene(NamedTuple):
 
     boxes: Bodies
     balls: Bodies
-    atlas: jax.Array
-    light: jax.Array
-    ambient: jax.Array
+    atlas: Array
+    light: Array
+    ambient: Array
     effects: Effects
 
 
@@ -104,10 +104,10 @@ class Frame(NamedTuple):
     point: (H, W, 3) world point at the pixel's centre.
     """
 
-    image: jax.Array
-    depth: jax.Array
-    body: jax.Array
-    point: jax.Array
+    image: Array
+    depth: Array
+    body: Array
+    point: Array
 
 
 @dataclass(frozen=True)
@@ -129,6 +129,6 @@ class SimulatedScene:
     width: int
 
     @property
-    def frames(self):
+    def frames(self) -> int:
         """N."""
         return len(self.taken)

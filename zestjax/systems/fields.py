@@ -8,10 +8,10 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from zestjax.base.checks import check_counts, check_option
 from zestjax.base.parts import part
+from zestjax.base.types import Scalar
 from zestjax.encoding import Volume, VolumeParams
 from zestjax.fields import dynamic, static
 from zestjax.fields.conditioning import SourceViews, parallax, sample_views
@@ -55,8 +55,8 @@ class Place(NamedTuple):
 
     frustum: Frustum
     spacing: str
-    time: jax.Array | np.floating
-    duration: jax.Array | np.floating
+    time: Scalar
+    duration: Scalar
 
     def world(self, coords):
         """World points (..., 3) of coords."""

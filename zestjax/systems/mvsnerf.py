@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from zestjax.base.checks import check_counts, check_option, check_shapes
 from zestjax.base.parts import part
+from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera, project, scaled
 from zestjax.cost_volume import mvsnerf_cost_volume, quarter_colours
 from zestjax.fields.static import StaticSample
@@ -54,10 +55,10 @@ class MvsNerfParams(NamedTuple):
 class Sources(NamedTuple):
     """images: (V, H, W, 3) in [0, 1]. cameras: `Camera` (V, ...). near, far: () of the reference, world units."""
 
-    images: jax.Array
+    images: Array
     cameras: Camera
-    near: jax.Array
-    far: jax.Array
+    near: Scalar
+    far: Scalar
 
 
 class FieldOutput(NamedTuple):

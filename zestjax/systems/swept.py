@@ -55,7 +55,7 @@ class OwnDepths:
         """Nothing is learned in the tables."""
         return 0
 
-    def sweep(self, params, frames, maps, inputs):
+    def sweep(self, params: VolumeParams, frames: Frames, maps: FrameMaps | None, inputs: Inputs) -> SweepViews:
         """See `Tables`."""
         moving, surface, tolerance = _trust_maps(maps, inputs)
         parts = [cell_values(half_images(frames.images)), pooled(moving[..., None], 2)]
@@ -63,10 +63,10 @@ class OwnDepths:
         cameras, times = resized(frames.cameras, 1 / SIDE, 1 / SIDE), frames.times - inputs.time
         return SweepViews(jnp.concatenate(parts, -1), cameras, frames.valid, times)
 
-    def views(self, frames, maps, inputs):
+    def views(self, frames: Frames, maps: FrameMaps | None, inputs: Inputs) -> SourceViews:
         """See `Tables`."""
-        (moving, *maps), size = _trust_maps(maps, inputs), frames.images.shape[1:3]
-        wide = [grown(moving, size, factor=2), *(grown(x, size, factor=4) for x in maps)]
+        (moving, *rest), size = _trust_maps(maps, inputs), frames.images.shape[1:3]
+        wide = [grown(moving, size, factor=2), *(grown(x, size, factor=4) for x in rest)]
         tables = jnp.concatenate([frames.images, jnp.stack(wide, -1)], axis=-1)
         return SourceViews(tables, frames.cameras, frames.valid, frames.times - inputs.time)
 
@@ -90,14 +90,15 @@ class Pyramid:
     def __post_init__(self):
         check_counts("Pyramid", channels=(self.channels, 4, MOST_CHANNELS))
 
-    def sweep(self, params, frames, maps, inputs):
+    def sweep(self, params: VolumeParams, frames: Frames, maps: FrameMaps | None, inputs: Inputs) -> SweepViews:
         """See `Tables`."""
+        assert params.pyramid is not None  # `Swept.init` made one, as there are channels
         features = feature_pyramid(params.pyramid, frames.images)
         tables = jnp.concatenate([features, frames.images[:, ::SIDE, ::SIDE]], axis=-1)
         cameras, times = scaled(frames.cameras, 1 / SIDE, 1 / SIDE), frames.times - inputs.time
         return SweepViews(tables, cameras, frames.valid, times)
 
-    def views(self, frames, maps, inputs):
+    def views(self, frames: Frames, maps: FrameMaps | None, inputs: Inputs) -> SourceViews:
         """See `Tables`."""
         return SourceViews(frames.images, frames.cameras, frames.valid, frames.times - inputs.time)
 

@@ -4,18 +4,31 @@ N        frames of the video
 exclude  frames that must serve nothing: they are what is to be predicted
 """
 
+from collections.abc import Collection
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from zestjax.base.checks import traced
+from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera
 from zestjax.frames.assembly import colours_of, positions, taken
 from zestjax.systems.system import System
 from zestjax.video import Frames, Inputs
 
 
-def target_inputs(images, cameras, near, far, camera, time, *, system: System, exclude=()):
+def target_inputs(
+    images: Array,
+    cameras: Camera,
+    near: Scalar,
+    far: Scalar,
+    camera: Camera,
+    time: int | Array,
+    *,
+    system: System,
+    exclude: Collection[int] = (),
+) -> tuple[Inputs, Array]:
     """`Inputs` of a target, and which frames they hold. Anything but what to exclude may be traced: frames are then
     chosen by JAX, and their arrays gathered.
 

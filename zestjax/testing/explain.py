@@ -4,12 +4,14 @@ term   one named loss of several
 group  parameters that share the first steps of their path in the tree
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.types import Tree
 from zestjax.testing.origin import Origin, find_origin
 
 NOT_FOUND = "not finite, yet nothing is found where it begins: run one at a time, all operations are finite"
@@ -39,7 +41,7 @@ class Explanation(NamedTuple):
         return "\n".join([head, *rows, found])
 
 
-def explain_gradient(losses, params, *, depth=1):
+def explain_gradient(losses: Callable, params: Tree, *, depth: int = 1) -> Explanation:
     """Value and gradient norms of every term by group, and the origin of what is not finite.
 
     One program is compiled for all terms; each that is not finite in it is asked once more, alone.

@@ -1,18 +1,20 @@
 """Checks for a loss of one's own: is it finite, and is its gradient its slope?"""
 
 import functools
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.types import Tree
 from zestjax.testing.raised import is_float, raised, wide
 from zestjax.testing.walk import contains, program, run
 
 UNSEEN = ("while", "cond")  # what is inside them is not held
 
 
-def assert_finite(fn, *args):
+def assert_finite(fn: Callable, *args: Tree) -> None:
     """Values and the gradients of their sum are finite, at and in every argument.
 
     Args:
@@ -35,13 +37,13 @@ def assert_finite(fn, *args):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def value_and_gradients(fn, *args):
+def value_and_gradients(fn: Callable, *args: Tree) -> tuple[Tree, tuple[Tree, ...]]:
     """(fn(*args), the gradient of the sum of its value in every argument), compiled once for a function and shapes."""
     total = lambda *args: sum(jnp.sum(x) for x in jax.tree.leaves(fn(*args)))
     return fn(*args), jax.grad(total, argnums=tuple(range(len(args))))(*args)
 
 
-def held(fn, *args):
+def held(fn: Callable, *args: Tree) -> Callable:
     """The function whose slope at `args` is the gradient: what passes a `stop_gradient` keeps its value there.
 
     Args:
@@ -81,7 +83,16 @@ def _branches(equation):
     return [*params.get("branches", ()), *(params[n] for n in ("cond_jaxpr", "body_jaxpr") if n in params)]
 
 
-def assert_grads_match(fn, *args, constant=(), step=1e-6, directions=3, rtol=1e-5, atol=1e-7, seed=0):
+def assert_grads_match(
+    fn: Callable,
+    *args: Tree,
+    constant: Sequence[Tree] = (),
+    step: float = 1e-6,
+    directions: int = 3,
+    rtol: float = 1e-5,
+    atol: float = 1e-7,
+    seed: int = 0,
+) -> None:
     """The gradient of a random mix of a function's outputs is its slope, by central differences in float64.
 
     The function is traced as it is, and its program, with what it closes over and casts to, is run in float64 (see

@@ -6,12 +6,14 @@ healed  an origin taken away, to see what is left: what is not finite there is r
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.types import Tree
 from zestjax.testing.walk import bind, place_of, program, run
 
 KINDS = {"nan": np.isnan, "inf": np.isinf}
@@ -39,7 +41,7 @@ class Origin(NamedTuple):
         return f"not finite first in the {self.stage} of `{self.term}`: {found}"
 
 
-def find_origin(loss, params, term):
+def find_origin(loss: Callable, params: Tree, term: str) -> Origin | None:
     """Where what is not finite in a loss or its gradient begins.
 
     Args:

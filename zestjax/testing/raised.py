@@ -6,6 +6,7 @@ So a loss that casts to float32 inside, or meets a float32 batch, needs no secon
 wide     the float64 or complex128 of a narrower type; integers, bools and PRNG keys are their own
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,13 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from zestjax.base.types import Tree
 from zestjax.testing.walk import INLINED, bind, inner_programs, place_of, program
 
 FOREIGN = ("pure_callback", "io_callback", "ffi_call", "pallas_call")  # written for one type by another hand
 OF_BITS = "bitcast_convert_type"  # how random numbers are made: stays as wide as it is
 
 
-def raised(fn, *args):
+def raised(fn: Callable, *args: Tree) -> Callable:
     """The function in float64, whatever it is made of; call it with `wide` arguments where 64 bits are switched on.
 
     Args:
@@ -41,12 +43,12 @@ def raised(fn, *args):
     return again
 
 
-def wide(tree):
+def wide(tree: Tree) -> Tree:
     """The tree's floating-point arrays in float64; all else as it is."""
     return jax.tree.map(lambda x: jnp.asarray(x, _wide_type(_type(x))) if is_float(x) else x, tree)
 
 
-def is_float(x):
+def is_float(x: Any) -> bool:
     """Whether a leaf is an array of real floating-point numbers."""
     return jnp.issubdtype(_type(x), jnp.floating)
 

@@ -4,17 +4,22 @@ primitive  an operation that JAX does not take apart further
 visit      `visit(equation, inputs, outputs) -> outputs`, called for every primitive in the order of the program
 """
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax._src import source_info_util
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+
+from zestjax.base.types import Array, Tree
 
 INNER = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 INLINED = ("jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2", "custom_jvp_call",
            "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
 
 
-def program(fn, *args):
+def program(fn: Callable, *args: Tree) -> tuple[ClosedJaxpr, list[jax.Array], Any]:
     """(`ClosedJaxpr`, leaves of the arguments, tree of the result) of a function of pytrees."""
     leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, args))
     flat = lambda *leaves: fn(*jax.tree.unflatten(tree, leaves))
@@ -22,7 +27,7 @@ def program(fn, *args):
     return jaxpr, leaves, jax.tree.structure(shape)
 
 
-def run(closed, leaves, visit, *, taken=False):
+def run(closed: ClosedJaxpr, leaves: Sequence[Array], visit: Callable, *, taken: bool = False) -> list[Array]:
     """Outputs of a program; what is compiled, rematerialised or scanned inside is walked through too.
 
     Args:
@@ -38,7 +43,7 @@ def run(closed, leaves, visit, *, taken=False):
     return _run(closed, leaves, visit, taken)
 
 
-def contains(closed, name):
+def contains(closed: ClosedJaxpr | Jaxpr, name: str) -> bool:
     """Whether a primitive of this name is anywhere in a program."""
     return any(
         e.primitive.name == name or any(contains(j, name) for j in inner_programs(e)) for e in _jaxpr(closed).eqns
@@ -49,7 +54,7 @@ def _jaxpr(program):
     return program.jaxpr if isinstance(program, ClosedJaxpr) else program
 
 
-def inner_programs(equation):
+def inner_programs(equation: JaxprEqn) -> list[ClosedJaxpr | Jaxpr]:
     """Programs that an operation holds: of what it calls, of its branches, of a loop's condition and turn."""
     values = [equation.params[name] for name in INNER if name in equation.params]
     return values + list(equation.params.get("branches", ())) + [
@@ -82,13 +87,13 @@ def _outputs(equation, inputs, visit, taken):
     return visit(equation, inputs, bind(equation, inputs))
 
 
-def bind(equation, inputs):
+def bind(equation: JaxprEqn, inputs: Sequence[Array]) -> list[jax.Array]:
     """Outputs of one operation, a list."""
     outputs = equation.primitive.bind(*inputs, **equation.params)
     return list(outputs) if equation.primitive.multiple_results else [outputs]
 
 
-def place_of(equation):
+def place_of(equation: JaxprEqn) -> str:
     """File, line and function that asked for an operation; empty where JAX has not kept them."""
     return source_info_util.summarize(equation.source_info)
 

@@ -6,7 +6,7 @@ h w      cells, a quarter of the image
 planes   fractional plane index of a true depth, 0 at near
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -207,7 +207,7 @@ def frame_batch(key, clips, system: System):
     return jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
 
 
-def _shown(clip, kind, index):
+def _shown(clip, kind, index) -> dict[str, Any]:
     """Everything known about a target, whole image; what is not known is left out."""
     if kind == "view":
         camera = Camera(clip.target_intrinsics[index], clip.target_camera_from_world[index])
