@@ -27,15 +27,16 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from zestjax.apps.host import host_camera, host_video
 from zestjax.apps.paths import camera_path
 from zestjax.apps.weights import recipe_from_metadata
 from zestjax.base.parts import to_stored
+from zestjax.cameras import Camera
 from zestjax.io.reading import FileWarning
 from zestjax.io.scenes import load_scene
 from zestjax.io.torch_files import LEGACY_MAGIC, read_torch
 from zestjax.io.weights import WeightsError, load_weights, save_weights
 from zestjax.train.recipes import TINY
+from zestjax.video import Video
 
 N, HEIGHT, WIDTH = 3, 24, 32
 MOST_MEMORY = 3 * 2**30  # bytes of address space that loading a file of a few kB may take
@@ -153,7 +154,7 @@ def camera_file(suffix, retell):
         k = np.tile([[30.0, 0, 15.5], [0, 30, 11.5], [0, 0, 1]], (N, 1, 1))
         stored = {"intrinsics": k, "camera_from_world": np.tile(np.eye(4), (N, 1, 1)), "times": np.arange(N)}
         images = np.zeros((N, HEIGHT, WIDTH, 3), np.float32)
-        shown = host_video(images, host_camera(*list(stored.values())[:2]), np.float32(1), np.float32(9))
+        shown = Video(images, Camera(*list(stored.values())[:2]), np.float32(1), np.float32(9))
         file = folder / f"path{suffix}"
         if suffix == ".npz":
             np.savez(file, **stored)

@@ -10,9 +10,9 @@ import pytest
 import stage
 
 from zestjax.apps import paths, scoring, stereo, tables, train
-from zestjax.apps.host import host_camera, host_video
 from zestjax.cameras import Camera, project, rigid_inverse, unproject
 from zestjax.frames.known import known_frames
+from zestjax.video import Video
 
 
 def test_the_stereo_pair_agrees_with_its_calibration():
@@ -107,7 +107,7 @@ def video():
     poses = np.tile(np.eye(4, dtype=np.float32), (frames, 1, 1))
     poses[:, 0, 3] = 0.2 * (np.arange(frames) % 4)
     images = np.zeros((frames, 24, 32, 3), np.float32)
-    return host_video(images, host_camera(intrinsics, poses), np.float32(2), np.float32(8))
+    return Video(images, Camera(intrinsics, poses), np.float32(2), np.float32(8))
 
 
 @pytest.mark.parametrize("name", sorted(paths.PATHS))

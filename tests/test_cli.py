@@ -16,11 +16,11 @@ import pytest
 from zestjax import novel_view
 from zestjax.apps import cache, frontier, tables
 from zestjax.apps.cli import main
-from zestjax.apps.host import host_camera, host_video
 from zestjax.apps.producer import ProducerError
 from zestjax.apps.train import TrainOptions, fresh
 from zestjax.apps.weights import ablated_name, arithmetic, open_weights
 from zestjax.base.parts import to_stored
+from zestjax.cameras import Camera
 from zestjax.io.nsff import write_nsff
 from zestjax.io.scenes import Target
 from zestjax.io.video import read_video
@@ -28,6 +28,7 @@ from zestjax.io.weights import save_weights
 from zestjax.novel_view import View
 from zestjax.systems.presets import ABLATED
 from zestjax.train.recipes import RECIPES, TINY
+from zestjax.video import Video
 
 FRAMES, HEIGHT, WIDTH = 6, 32, 48
 
@@ -37,7 +38,7 @@ def camera(step):
     focal = np.array([[40, 0, (WIDTH - 1) / 2], [0, 40, (HEIGHT - 1) / 2], [0, 0, 1]], np.float32)
     pose = np.eye(4, dtype=np.float32)
     pose[0, 3] = 0.1 * step
-    return host_camera(focal, pose)
+    return Camera(focal, pose)
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +47,8 @@ def places(tmp_path_factory):
     root = tmp_path_factory.mktemp("cli")
     rng = np.random.default_rng(0)
     images = rng.random((FRAMES, HEIGHT, WIDTH, 3), np.float32)
-    cameras = host_camera(*(np.stack(leaf) for leaf in zip(*(camera(i % 3) for i in range(FRAMES)), strict=True)))
-    video = host_video(images, cameras, np.float32(1), np.float32(5))
+    cameras = Camera(*(np.stack(leaf) for leaf in zip(*(camera(i % 3) for i in range(FRAMES)), strict=True)))
+    video = Video(images, cameras, np.float32(1), np.float32(5))
     dynamic = np.zeros((HEIGHT, WIDTH), bool)
     dynamic[8:20, 8:30] = True
     depth = np.full((HEIGHT, WIDTH), 2, np.float32)

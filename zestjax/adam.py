@@ -5,7 +5,7 @@ grads    tree like the params
 moments  trees like the params in at least float32
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +25,9 @@ class AdamState(NamedTuple):
     skipped: jax.Array
     value: jax.Array
     error: jax.Array
-    mean: Any
-    square: Any
-    aux: Any
+    mean: Tree
+    square: Tree
+    aux: Tree
 
 
 def moment_dtype(x: Array) -> DTypeLike:

@@ -13,7 +13,7 @@ Names and axes, the same in every function of this file:
 Leading axes `...` are free. `lengths` and `depths` may lack them, (S,), when every ray is sampled alike.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ class Rendered(NamedTuple):
     weights: (..., S).
     """
 
-    values: Any
+    values: Tree
     opacity: jax.Array
     weights: Array
 

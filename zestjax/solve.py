@@ -35,9 +35,9 @@ class Fit(NamedTuple):
     """params: like the initial ones. total, terms, grad_norm (() L2): at them, or at the last batch before the last
     step. steps: () int. converged: () bool, that the solver's own stopping measure came down to tol."""
 
-    params: Any
+    params: Tree
     total: jax.Array
-    terms: Any
+    terms: Tree
     grad_norm: jax.Array
     steps: jax.Array
     converged: jax.Array
@@ -76,7 +76,7 @@ class Adam(StochasticSolver):
     tol: float = 0.0
     verbose: bool = False
     jit: bool = True
-    unroll: Any = "auto"
+    unroll: int | str = "auto"
     implicit_diff: bool = False
     implicit_diff_solve: Callable | None = None
 

@@ -7,7 +7,7 @@ import functools
 
 import numpy as np
 
-from zestjax.apps.host import host_camera
+from zestjax.cameras import Camera
 from zestjax.frames.assembly import footage, video_evidence
 from zestjax.frames.known import KnownFrames, known_frames
 from zestjax.io.scenes import Scene
@@ -39,7 +39,7 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
       exclude: frames that serve nothing, not even as targets.
     """
     usable = np.array([i for i in range(len(known.images)) if i not in set(exclude)])
-    cameras, maps = host_camera(known.intrinsics, known.camera_from_world), recipe.system.frames
+    cameras, maps = Camera(known.intrinsics, known.camera_from_world), recipe.system.frames
     seen = None if maps is None else footage(known.images)
 
     @functools.lru_cache(maxsize=16)

@@ -12,9 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zestjax.apps.host import host_camera
 from zestjax.cameras import Camera, check_camera, look_at, rigid_inverse
-from zestjax.io.layouts import as_float32
+from zestjax.io.layouts import as_float32, select
 from zestjax.io.reading import json_numbers, read_arrays, read_json
 
 CIRCLE = lambda s: np.stack([np.sin(2 * np.pi * s), np.cos(2 * np.pi * s), 0 * s], -1)
@@ -59,7 +58,7 @@ def camera_path(name, video, *, count=None):
         return _path_from_file(Path(name), frames)
     if name == "frames":
         index = np.round(np.linspace(0, frames - 1, count or frames)).astype(int)
-        return CameraPath(host_camera(*(np.asarray(leaf)[index] for leaf in video.cameras)), index)
+        return CameraPath(select(video.cameras, index), index)
     count = 2 * frames if count is None else count
     s = np.arange(count) / count
     times = np.full(count, frames // 2) if name == "freeze" else np.floor(s * frames).astype(int)
@@ -90,7 +89,7 @@ def _moved(base, offsets, video):
     inwards = np.array([0, 0, _middle(video)])
     moved = position + np.einsum("tij,tj->ti", rotation, offsets * _radius(video))
     pose = look_at(*(x.astype(np.float32) for x in (moved, position + rotation @ inwards)), up=-rotation[:, :, 1])
-    return host_camera(intrinsics.astype(np.float32), np.asarray(pose))
+    return Camera(intrinsics.astype(np.float32), np.asarray(pose))
 
 
 def _middle(video):
@@ -115,7 +114,7 @@ def _path_from_file(path, frames):
             f"{path}: should hold `intrinsics`, `camera_from_world` and `times`, has no {missing}; write it again."
         )
     leaves = (json_numbers(path, stored, name, shape=(None, *shape)) for name, shape in SHAPES.items())
-    camera = host_camera(*(as_float32(path, leaf) for leaf in leaves))
+    camera = Camera(*(as_float32(path, leaf) for leaf in leaves))
     times = json_numbers(path, stored, "times", shape=(None,))
     if (times != np.round(times)).any():
         raise ValueError(f"{path}: `times` should be whole numbers, got {times[times != np.round(times)][0]:g}.")

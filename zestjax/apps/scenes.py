@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.apps.host import host_camera
 from zestjax.base.checks import check_option
 from zestjax.cameras import project, unproject
 from zestjax.io.files import resolved
+from zestjax.io.layouts import select
 from zestjax.io.scenes import PROTOCOLS, Scene, Target, load_scene
 from zestjax.simulate.bench import BENCH
 
@@ -121,7 +121,7 @@ def held_out_camera(simulated, time):
 
 def target_from_answers(shown, i, camera, protocol):
     """The i-th of `Answers` as a `Target`; its flow is towards the next time, as its own camera would see it."""
-    time, view = int(shown.times[i]), host_camera(*(np.asarray(leaf)[i] for leaf in shown.cameras))
+    time, view = int(shown.times[i]), select(shown.cameras, i)
     return Target(
         time=time,
         camera_name="input" if protocol != "held-out" else f"cam{camera + 1:02d}",  # numbered as published

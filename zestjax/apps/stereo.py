@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from zestjax.apps.host import host_camera, host_video
 from zestjax.cameras import Camera, resized
 from zestjax.io.pictures import resize_area, resize_nearest
 from zestjax.video import Video
@@ -53,9 +52,9 @@ def stereo_scene(height, width):
     images = np.stack([resize_area(picture, *size) for picture in pictures])
     middle, seen = carried_half_way(pictures[0], pictures[1], disparity)
     return StereoScene(
-        host_video(images, host_camera(*map(np.asarray, cameras)), np.float32(near), np.float32(far)),
+        Video(images, Camera(*map(np.asarray, cameras)), np.float32(near), np.float32(far)),
         resize_nearest(depth, *size).astype(np.float32),
-        host_camera(*map(np.asarray, resized(camera(0.5, top), factors[0], factors[1]))),
+        Camera(*map(np.asarray, resized(camera(0.5, top), factors[0], factors[1]))),
         resize_area(np.where(seen[..., None], middle, 0).astype(np.float32), *size),
         resize_area(seen.astype(np.float32)[..., None].repeat(3, -1), *size)[..., 0] > 0.999,
     )
@@ -67,7 +66,7 @@ def camera(share, top):
     intrinsics = np.array([[FOCAL, 0, centre[0]], [0, FOCAL, centre[1]], [0, 0, 1]], np.float32)
     pose = np.eye(4, dtype=np.float32)
     pose[0, 3] = -share * BASELINE
-    return host_camera(intrinsics, pose)
+    return Camera(intrinsics, pose)
 
 
 def carried_half_way(left, right, disparity):

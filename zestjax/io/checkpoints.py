@@ -24,7 +24,7 @@ class Checkpoint(NamedTuple):
     """
 
     step: int
-    tree: Any
+    tree: Tree
     metadata: dict
     path: Path
     warnings: tuple[str, ...]

@@ -199,4 +199,4 @@ def frames_by_number(
 
 def select(cameras: Camera, index: int | slice | Sequence[int] | np.ndarray) -> Camera:
     """The camera, or cameras, at an index of the leading axis."""
-    return Camera._make(np.asarray(leaf)[index] for leaf in cameras)
+    return Camera(*(np.asarray(leaf)[index] for leaf in cameras))

@@ -51,7 +51,7 @@ def read_nrnerf(path: Path) -> Record:
         name=path.resolve().name,
         layout="nrnerf",
         images=tuple(images[index] for index in kept),
-        cameras=Camera._make(map(np.asarray, cameras)),
+        cameras=Camera(*map(np.asarray, cameras)),
         size=(height, width),
         near=near,
         far=far,

@@ -76,7 +76,7 @@ def read_nsff(path: Path) -> Record:
     check_order(images, source)
     poses = rows[:, :15].astype(np.float64).reshape(-1, 3, 5)
     size, _ = check_sizes(source, poses[..., 4])
-    cameras = Camera._make(map(np.asarray, camera_from_llff_pose(as_float32(source, poses))))
+    cameras = Camera(*map(np.asarray, camera_from_llff_pose(as_float32(source, poses))))
     scene = path.resolve().parent if path.resolve().name == "dense" else path.resolve()
     name, bounds = _about(root / "scene.json")
     near, far = bounds or bounds_from_frames(rows[:, 15:], where=str(source))
@@ -263,7 +263,7 @@ def _camera_of(truth):
         raise ValueError(f"{truth}: holds half a camera, `{missing.pop()}` is missing; write it again.")
     shapes = dict(intrinsics=(3, 3), camera_from_world=(4, 4))
     check = lambda name: check_numbers(truth, arrays[name], shape=shapes[name], name=name, finite=True)
-    camera = Camera._make(as_float32(truth, check(name)) for name in Camera._fields)
+    camera = Camera(*(as_float32(truth, check(name)) for name in Camera._fields))
     check_camera(str(truth), camera)
     return camera
 

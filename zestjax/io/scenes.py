@@ -146,7 +146,7 @@ def load_scene(
     for i in shown:
         images[i] = resize_area(read_image(record.images[i], native=record.size), *size)
     cameras = _resized(record.cameras, record.size, size)
-    video = Video._make((images, cameras, np.float32(record.near), np.float32(record.far)))
+    video = Video(images, cameras, np.float32(record.near), np.float32(record.far))
     check_inputs(str(path), video)
     masks = masks_of(record, size)
     listed = _listed(record, video, masks, protocol)
@@ -215,8 +215,8 @@ def _size(have, height, width):
 
 def _resized(cameras, have, size):
     """The cameras of pictures of `size`, from those of pictures of size `have`, both (height, width)."""
-    cameras = Camera._make(np.asarray(leaf, np.float32) for leaf in cameras)
-    return Camera._make(map(np.asarray, resized(cameras, size[1] / have[1], size[0] / have[0])))
+    cameras = Camera(*(np.asarray(leaf, np.float32) for leaf in cameras))
+    return Camera(*map(np.asarray, resized(cameras, size[1] / have[1], size[0] / have[0])))
 
 
 def _listed(record, video, masks, protocol):

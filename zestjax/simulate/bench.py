@@ -6,7 +6,6 @@ Photographs are disjoint from the ones models are trained on (`textures.PHOTOGRA
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -64,10 +63,10 @@ def bench_scene(name: str, *, height: int = 144, width: int = 256) -> SimulatedS
     room = {"half_width": 0.9 * view.across * view.reach + 0.8, "ceiling": 1.6, "behind": 4.0}
     props.add_room(layout, chance, view, **(room | recipe.room))
     recipe.fill(layout, chance, view)
-    gain: dict[str, Any] = {"exposure": np.full((FRAMES, 3), recipe.gain, np.float32)}
+    exposure = np.full((FRAMES, 3), recipe.gain, np.float32)
     scene = layout.scene(
         atlas=random_atlas(chance, "bench"), light=recipe.light, ambient=recipe.ambient,
-        effects=Effects(**(gain | recipe.effects)), mid_time=MIDDLE,
+        effects=Effects(**({"exposure": exposure} | recipe.effects)), mid_time=MIDDLE,
     )  # fmt: skip
     middle = np.sqrt(view.reach)
     spacing = recipe.disparity * view.width(middle)

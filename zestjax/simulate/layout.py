@@ -113,15 +113,9 @@ class Layout:
             if count > most:
                 raise ValueError(f"Layout.scene: {count} {kind}, expected at most {most}.")
         index = lambda handle: -1 if handle is None else handle[1] + (boxes if handle[0] == "ball" else 0)
-        tables: list[Any] = [
-            _table(bodies, count, index, mid_time, unit)
-            for bodies, count in ((self._boxes, boxes), (self._balls, balls))
-        ]
-        lamp: dict[str, Any] = {
-            "light": np.asarray(light, np.float32) * np.float32(unit),
-            "ambient": np.float32(ambient),
-        }
-        return Scene(boxes=tables[0], balls=tables[1], atlas=atlas, effects=effects, **lamp)
+        table = lambda bodies, count: _table(bodies, count, index, mid_time, unit)
+        light = np.asarray(light, np.float32) * np.float32(unit)
+        return Scene(table(self._boxes, boxes), table(self._balls, balls), atlas, light, np.float32(ambient), effects)
 
 
 def _scaled(matrix, unit, *, offset_only=False):

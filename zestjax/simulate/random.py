@@ -8,7 +8,7 @@ rigs, arcs and hands, static scenes, scenes in which everything moves, dark ones
     T        targets
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -133,14 +133,13 @@ def _random_effects(chance, frames):
             1 + chance.uniform(0.0, 0.03) * chance.normal(0, 1, (frames, 1)) + chance.normal(0, 0.005, (frames, 3))
         )
     sometimes = lambda share, low, high: np.float32(chance.uniform(low, high) if chance.random() < share else 0)
-    strengths: dict[str, Any] = {
-        "shadows": sometimes(0.6, 0.3, 0.9),
-        "specular": sometimes(0.5, 0.3, 1),
-        "motion_blur": sometimes(0.3, 0.2, 0.8),
-        "exposure": exposure.astype(np.float32),
-        "noise": sometimes(0.5, 0, 0.025),
-    }
-    return Effects(**strengths)
+    return Effects(
+        shadows=sometimes(0.6, 0.3, 0.9),
+        specular=sometimes(0.5, 0.3, 1),
+        motion_blur=sometimes(0.3, 0.2, 0.8),
+        exposure=exposure.astype(np.float32),
+        noise=sometimes(0.5, 0, 0.025),
+    )
 
 
 def _fill(layout, chance, view, frames, farthest):

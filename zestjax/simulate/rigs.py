@@ -5,7 +5,6 @@ width    of the view at a distance: 2 * tan(half the horizontal field of view) *
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -43,8 +42,7 @@ def cameras_at(positions: np.ndarray, angles: np.ndarray, intrinsics: np.ndarray
     poses = np.tile(np.eye(4), (len(yaw), 1, 1))
     poses[:, :3, :3] = rotation
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", rotation, np.asarray(positions, np.float64) * unit)
-    leaves: tuple[Any, Any] = (np.tile(np.asarray(intrinsics, np.float32), (len(yaw), 1, 1)), poses.astype(np.float32))
-    return Camera(*leaves)
+    return Camera(np.tile(np.asarray(intrinsics, np.float32), (len(yaw), 1, 1)), poses.astype(np.float32))
 
 
 def angles_towards(positions: np.ndarray, target: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zestjax.base.types import Array
+from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera
 
 
@@ -75,11 +75,11 @@ class Effects(NamedTuple):
     noise: () standard deviation of the sensor's noise, applied only where a key is given.
     """
 
-    shadows: Array | None = None
-    specular: Array | None = None
-    motion_blur: Array | None = None
+    shadows: Scalar | None = None
+    specular: Scalar | None = None
+    motion_blur: Scalar | None = None
     exposure: Array | None = None
-    noise: Array | None = None
+    noise: Scalar | None = None
 
 
 class Scene(NamedTuple):
@@ -91,7 +91,7 @@ class Scene(NamedTuple):
     balls: Bodies
     atlas: Array
     light: Array
-    ambient: Array
+    ambient: Scalar
     effects: Effects
 
 
