@@ -145,7 +145,7 @@ def whitened(values):
 
 def projected_flow(points, moves):
     shares = jnp.full(points.shape[:1], 0.25, points.dtype)
-    return flow.optical_flow(shares, points, moves, camera()(points), jnp.zeros(2, points.dtype)).flow
+    return flow.induced_flow(shares, points, moves, camera()(points), jnp.zeros(2, points.dtype)).flow
 
 
 def masked(mask):

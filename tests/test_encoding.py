@@ -79,9 +79,9 @@ def test_votes_are_finite_and_bounded(surface, tolerance):
 
 
 OPTIONS = {
-    "geometry": dict(colours="mean", trusted=True, slots=False),
-    "motion": dict(colours="mean", trusted=True, slots=True),
-    "paper": dict(colours="all", trusted=False, slots=False),
+    "geometry": dict(colours="mean", trusted=True, motion_votes=False),
+    "motion": dict(colours="mean", trusted=True, motion_votes=True),
+    "paper": dict(colours="all", trusted=False, motion_votes=False),
 }
 FEATURES = {"geometry": 0, "motion": 0, "paper": 4}
 

@@ -11,7 +11,7 @@ from oracles import assert_grads_match, normal, uniform, value_and_gradients
 
 from zestjax.frames import cells as cells_module
 from zestjax.frames import evidence, optical_flow
-from zestjax.frames.evidence import FLOW_RANGE, GAP, TRUNCATION, Neighbours, Sources
+from zestjax.frames.evidence import FLOW_RANGE, GAP, TRUNCATION, MatchingViews, Neighbours
 from zestjax.planesweep import plane_depths
 
 pooled = jax.jit(cells_module.pooled, static_argnums=1)
@@ -88,7 +88,7 @@ def static_by_loop(reference, images, pairs, valid):
 
 
 def sources(images, valid):
-    return Sources(jnp.asarray(images), None, jnp.asarray(valid, jnp.float32))
+    return MatchingViews(jnp.asarray(images), None, jnp.asarray(valid, jnp.float32))
 
 
 @pytest.mark.parametrize("valid", [[1, 1, 0], [1, 1, 1], [0, 1, 0]])
@@ -168,7 +168,7 @@ def test_costs_stay_in_range_with_finite_gradients(scale, level):
 
 def all_costs(image, hom, flow, sure):
     valid = jnp.ones(2, image.dtype)
-    static = evidence.static_costs(image, Sources(jnp.stack([image, image]), None, valid), hom)
+    static = evidence.static_costs(image, MatchingViews(jnp.stack([image, image]), None, valid), hom)
     return *static, *evidence.flow_gaps(flow, sure, hom)
 
 
@@ -179,7 +179,7 @@ def test_costs_match_finite_differences(x64):
     hom = jnp.asarray(shifts([(0.3, 0.4), (-0.6, 0.2)]), jnp.float64)
     valid = jnp.ones(2, jnp.float64)
     cost = lambda r, i, f, s: (
-        evidence.static_costs(r, Sources(i, None, valid), hom),
+        evidence.static_costs(r, MatchingViews(i, None, valid), hom),
         evidence.flow_gaps(f, s, hom),
     )
     assert_grads_match(cost, reference, images, 2 * draw(2, 2, 3, 3, 2), draw(3, 2, 3, 3), step=1e-7)
@@ -196,7 +196,7 @@ def found():
     camera = jax.tree.map(lambda x: x[2], video.cameras)
     far = [0, 1, 3, 4, 5]
     run = lambda known, near: find(
-        half[2], camera, Sources(half[np.array(far)], taken(far), known * np.ones(5, np.float32)),
+        half[2], camera, MatchingViews(half[np.array(far)], taken(far), known * np.ones(5, np.float32)),
         Neighbours(flow.flow[2], near * flow.sure[2], taken([3, 1])), stage.NEAR, stage.FAR,
     )  # fmt: skip
     return run

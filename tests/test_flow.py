@@ -9,7 +9,7 @@ from oracles import assert_finite, assert_grads_match, normal, uniform
 from zestjax import flow
 from zestjax.cameras import Camera
 
-seen_by = jax.jit(flow.optical_flow, static_argnames="normalise")
+seen_by = jax.jit(flow.induced_flow, static_argnames="normalise")
 
 
 def camera(*, focal=(100.0, 120.0), translation=(0.0, 0.0, 0.0), dtype=jnp.float32):
@@ -20,7 +20,7 @@ def camera(*, focal=(100.0, 120.0), translation=(0.0, 0.0, 0.0), dtype=jnp.float
 
 def landed(weights, points, motion, start):
     """What of an optical flow has a gradient."""
-    return flow.optical_flow(weights, points, motion, camera(), start)[:2]
+    return flow.induced_flow(weights, points, motion, camera(), start)[:2]
 
 
 def test_a_constant_flow_moves_points_by_its_multiples():
@@ -93,7 +93,7 @@ def test_gradients_match_finite_differences(x64):
     weights, *axes = uniform(2, 4, 2, 3, dtype=jnp.float64)
     points = jnp.stack(axes, -1) + jnp.array([0, 0, 2.0]).reshape(1, 1, 3)
     view, start = camera(dtype=jnp.float64), jnp.zeros((2, 2), jnp.float64)
-    fn = lambda w, p, m: flow.optical_flow(w, p, m, view, start).flow / 100
+    fn = lambda w, p, m: flow.induced_flow(w, p, m, view, start).flow / 100
     assert_grads_match(fn, weights, points, 0.1 * points)
 
 

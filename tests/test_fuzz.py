@@ -72,7 +72,7 @@ FUNCTIONS = {
         "values": ("P", "unit"), "target": ("P", "unit"), "mask": ("P", "mask")}),
     "align_robust": (depth.align_robust, {"values": ("P", "unit"), "target": ("P", "unit"), "mask": ("P", "mask")}),
     "expected": (flow.expected, RAY),
-    "optical_flow": (lambda weights, points, flow_: flow.optical_flow(
+    "induced_flow": (lambda weights, points, flow_: flow.induced_flow(
         weights, points, flow_, camera(points), jnp.zeros((*weights.shape[:-1], 2), points.dtype)),
         {"weights": ("R S", "unit"), "points": ("R S 3", "point"), "flow": ("R S 3", "real")}),
     "project": (lambda points: project(camera(points), points), {"points": ("R 3", "point")}),

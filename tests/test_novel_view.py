@@ -141,7 +141,7 @@ def test_what_is_static_does_not_flow():
         "Prediction", (), dict(marched=marched, dynamic=dynamic, dynamic_weights=share * weights, weights=weights)
     )
     weights = jnp.full((rays, samples), 1 / samples)
-    flow = lambda share: novel_view._optical_flow(prediction(share), place, CAMERA)
+    flow = lambda share: novel_view._induced_flow(prediction(share), place, CAMERA)
     np.testing.assert_array_equal(flow(0.0), 0)
     assert (flow(1.0)[:, 0] > 0.5).all()
 

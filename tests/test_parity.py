@@ -84,7 +84,7 @@ def projected(take):
     there = euclidean(mean, take["HWf"])
     seen = there @ take["w2c"][:3, :3].T + take["w2c"][None, :3, 3]
     opengl = jnp.stack([-focal * seen[:, 0] / seen[:, 2] + width / 2, focal * seen[:, 1] / seen[:, 2] + height / 2], -1)
-    ours = flow.optical_flow(weights, points, moved - points, camera, jnp.zeros((10, 2)))
+    ours = flow.induced_flow(weights, points, moved - points, camera, jnp.zeros((10, 2)))
     return {"ndc2euc": (points, None), "proj_from_ndc": (opengl, ours.pixels)}
 
 

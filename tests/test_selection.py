@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zestjax.frames.selection import RANKS, key_frames, slots
+from zestjax.frames.selection import RANKS, key_frames, neighbours
 
 LINE = np.stack([np.arange(12.0), np.zeros(12), np.zeros(12)], -1)  # frame i stands at x = i
 
@@ -41,7 +41,7 @@ def test_an_excluded_frame_is_never_chosen():
     for choice in ("nearest", "spread"):
         chosen = key_frames(LINE, 8, target=LINE[5], time=5, choice=choice, exclude=(5, 0))
         assert not {5, 0} & set(chosen.frames)
-    assert 5 not in slots(12, 5, offsets=(-1, 0, 1), exclude=(5,)).frames
+    assert 5 not in neighbours(12, 5, offsets=(-1, 0, 1), exclude=(5,)).frames
 
 
 @pytest.mark.parametrize("choice", ["nearest", "spread"])
@@ -67,11 +67,11 @@ def test_the_choice_does_not_depend_on_the_worlds_units_axes_or_origin(scale):
 
 
 def test_slots_are_the_neighbours_that_exist():
-    chosen = slots(6, 5, offsets=(-2, -1, 0, 1, 2))
+    chosen = neighbours(6, 5, offsets=(-2, -1, 0, 1, 2))
     assert chosen.frames.tolist() == [3, 4, 5, 5, 5] and chosen.valid.tolist() == [1, 1, 1, 0, 0]
-    chosen = slots(6, 2, offsets=(-2, -1, 1, 2), exclude=(2, 3))
+    chosen = neighbours(6, 2, offsets=(-2, -1, 1, 2), exclude=(2, 3))
     assert chosen.frames.tolist() == [0, 1, 4, 4] and chosen.valid.tolist() == [1, 1, 0, 1]
-    assert slots(6, 90, offsets=(-1, 0)).valid.tolist() == [0, 0]
+    assert neighbours(6, 90, offsets=(-1, 0)).valid.tolist() == [0, 0]
 
 
 def test_bad_choices_are_refused():

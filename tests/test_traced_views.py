@@ -10,7 +10,7 @@ import stage
 from stage import MINI, PAPER
 
 from zestjax.cameras import Camera
-from zestjax.frames.selection import key_frames, slots
+from zestjax.frames.selection import key_frames, neighbours
 from zestjax.novel_view import prepare, render_view
 
 CAMERA = jax.tree.map(jnp.asarray, stage.camera(0.1))
@@ -41,8 +41,10 @@ def test_frames_are_chosen_alike_whether_traced_or_not(exclude):
             known = key_frames(positions, count, target=target, time=time, exclude=exclude)
             found = jax.jit(lambda c, t, n=count: key_frames(positions, n, target=c, time=t, exclude=exclude))
             jax.tree.map(np.testing.assert_array_equal, found(target, time), known)
-        around = jax.jit(lambda t: slots(9, t, offsets=(-2, -1, 0, 1, 2), exclude=exclude))
-        jax.tree.map(np.testing.assert_array_equal, around(time), slots(9, time, offsets=range(-2, 3), exclude=exclude))
+        around = jax.jit(lambda t: neighbours(9, t, offsets=(-2, -1, 0, 1, 2), exclude=exclude))
+        jax.tree.map(
+            np.testing.assert_array_equal, around(time), neighbours(9, time, offsets=range(-2, 3), exclude=exclude)
+        )
 
 
 def test_a_compiled_view_is_the_view(scene):

@@ -16,7 +16,7 @@ from zestjax.base.checks import check_shapes
 from zestjax.base.numerics import matmul, matvec, safe_norm
 from zestjax.base.types import Array, Scalar
 
-NEAREST_DEPTH = 1e-6
+NEAREST_DEPTH = 1e-6  # world units in front of the camera: a depth that a pixel may be divided by, also in float32
 
 
 class Camera(NamedTuple):

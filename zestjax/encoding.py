@@ -23,10 +23,12 @@ from zestjax.nets.feature_pyramid import FeaturePyramid, init_feature_pyramid
 from zestjax.nets.layers import Dense, dense, init_dense, raised
 from zestjax.planesweep import carry, homographies, sweep_grid
 
-TRUST_MAPS = 3
+TRUST_MAPS = 3  # moving, inverse depth and its tolerance: the last channels of a trusted table
 CELL_COLOURS = 12  # the four half-resolution pixels of a cell
-VOTE_GAIN = 4.0
-LEAST_HEARD = 0.02  # about a slot two frames away: less does not shout
+VOTE_GAIN = 4.0  # first logit of a cell that all frames call a surface: a guess that was never varied
+# Least total weight by which motion votes are divided, about that of one frame two away (exp(-4)): votes of frames
+# far in time must not be scaled up to full strength.
+LEAST_WEIGHT = 0.02
 
 
 class VolumeParams(NamedTuple):
@@ -77,7 +79,7 @@ def init_volume(
     widths: Sequence[int],
     colours: str,
     trusted: bool,
-    slots: bool,
+    motion_votes: bool,
     pyramid_widths: tuple[int, int, int] | None,
     occupied: bool,
 ) -> VolumeParams:
@@ -91,13 +93,13 @@ def init_volume(
       colours: `all` keeps every view's warped colour (the paper's 32 + 3 V channels), `mean` the mean and variance
         of the cells' colours.
       trusted: whether tables carry trust maps.
-      slots: whether votes are kept slot by slot (motion) or averaged over frames (geometry).
+      motion_votes: whether votes are kept slot by slot (motion) or averaged over frames (geometry).
       pyramid_widths: of the feature net, or None without one.
       occupied: whether cells get a surface logit.
     """
     a, b, c = jax.random.split(key, 3)
     channels = features + (3 * views if colours == "all" else 2 * CELL_COLOURS + 1)
-    channels += (3 * views if slots else 4) * trusted
+    channels += (3 * views if motion_votes else 4) * trusted
     pyramid = None if pyramid_widths is None else init_feature_pyramid(a, widths=pyramid_widths)
     regulariser = init_cost_regulariser(b, channels, widths=widths)
     return VolumeParams(pyramid, regulariser, init_dense(c, widths[0], 1, scale=0.1) if occupied else None)
@@ -118,14 +120,14 @@ def cell_votes(samples: Array, hom: Array, grid: Array, depths: Array) -> Votes:
     point = 1 / jnp.where(seen, share * depths[:, None, None, None], 1)
     safe = jnp.where(seen, tolerance, 1)
     number = seen.astype(samples.dtype)
-    through = jnp.square(jnp.clip((point - surface) / safe / 3, 0, 1))
+    through = jnp.square(jnp.clip((point - surface) / safe / 3, 0, 1))  # full from 3 tolerances on, as `GAP_LIMIT` is
     return Votes(number, number * moving, number * agreement(surface, safe, point), number * through)
 
 
 def _geometry_votes(votes):
     """(D, h, w, 4) over the frames that show something still, and (D, h, w) what they say of a surface here."""
     still = votes.seen * (1 - votes.moving)
-    weight = jnp.maximum(jnp.sum(still, -1), 0.5)
+    weight = jnp.maximum(jnp.sum(still, -1), 0.5)  # less than half a frame that stands still has no full vote
     surface = jnp.sum(still * votes.surface, -1) / weight
     through = jnp.sum(still * votes.through, -1) / weight
     count = votes.seen.shape[-1]
@@ -134,12 +136,13 @@ def _geometry_votes(votes):
 
 
 def _motion_votes(votes, times):
-    """(D, h, w, 3 V) slot by slot, and (D, h, w) what they say of a moving surface here: the sooner, the louder."""
+    """(D, h, w, 3 V) slot by slot, and (D, h, w) what they say of a moving surface here; frames nearer
+    in time weigh more: exp(-2 |t|)."""
     support = votes.moving * votes.surface
     channels = jnp.concatenate([support, votes.moving, votes.through], -1)
-    loudness = jnp.exp(-2 * jnp.abs(times))[:, None]
-    heard = lambda x: (x @ loudness)[..., 0]
-    return channels, VOTE_GAIN * heard(support - votes.through) / jnp.maximum(heard(votes.seen), LEAST_HEARD)
+    nearness = jnp.exp(-2 * jnp.abs(times))[:, None]
+    weighted = lambda x: (x @ nearness)[..., 0]
+    return channels, VOTE_GAIN * weighted(support - votes.through) / jnp.maximum(weighted(votes.seen), LEAST_WEIGHT)
 
 
 def encode_volume(
@@ -151,7 +154,7 @@ def encode_volume(
     *,
     colours: str,
     trusted: bool,
-    slots: bool,
+    motion_votes: bool,
 ) -> Volume:
     """Sweep, compare, encode.
 
@@ -163,7 +166,7 @@ def encode_volume(
       depths: (D,) planes in the reference camera, world units.
       colours: as in `init_volume`.
       trusted: as in `init_volume`.
-      slots: as in `init_volume`.
+      motion_votes: as in `init_volume`.
 
     Returns:
       `Volume`.
@@ -178,7 +181,8 @@ def encode_volume(
     tables, trust = views.tables, None
     if trusted:
         moving, inverse_depth, tolerance = (tables[..., k] for k in range(-TRUST_MAPS, 0))
-        trust = Trust(0.1 + 0.9 * moving if slots else 1 - moving, inverse_depth, tolerance)
+        # For motion, what a frame calls still counts a tenth, as it may be wrong: a guess that was never varied.
+        trust = Trust(0.1 + 0.9 * moving if motion_votes else 1 - moving, inverse_depth, tolerance)
     kept = TRUST_MAPS if trusted else 3 * (colours == "all")
     cost = cost_volume(tables, hom, grid, trust=trust, depths=depths if trusted else None, per_view=kept)
     features = sizes["C"] - (3 if colours == "all" else CELL_COLOURS) - TRUST_MAPS * trusted
@@ -192,7 +196,7 @@ def encode_volume(
         channels, vote = [variance[..., : features + CELL_COLOURS], mean, count], 0
     if trusted:
         votes = cell_votes(cost.samples, hom, grid, depths)
-        extra, vote = _motion_votes(votes, views.times) if slots else _geometry_votes(votes)
+        extra, vote = _motion_votes(votes, views.times) if motion_votes else _geometry_votes(votes)
         channels.append(extra)
     cells = cost_regulariser(params.regulariser, jnp.concatenate(channels, axis=-1))
     if params.occupied is None:

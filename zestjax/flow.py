@@ -35,7 +35,7 @@ class Path(NamedTuple):
     valid: jax.Array
 
 
-class OpticalFlow(NamedTuple):
+class InducedFlow(NamedTuple):
     """Where a camera at the neighbouring time sees each ray's expected point.
 
     flow: (..., 2) pixels, (u, v). pixels: (..., 2) = the ray's own pixel + flow.
@@ -147,9 +147,9 @@ def expected(weights: Array, values: Array, *, normalise: bool = True) -> jax.Ar
     return total / jnp.maximum(jnp.sum(weights, axis=-1), EMPTY)[..., None]
 
 
-def optical_flow(
+def induced_flow(
     weights: Array, points: Array, flow: Array, camera: Camera, pixels: Array, *, normalise: bool = True
-) -> OpticalFlow:
+) -> InducedFlow:
     """Optical flow that a scene flow causes between a ray's pixel and a camera at the neighbouring time.
 
     Source: ZeST-NeRF eq. 20 and the projection in the text after it.
@@ -164,7 +164,7 @@ def optical_flow(
       normalise: see `expected`.
 
     Returns:
-      `OpticalFlow`.
+      `InducedFlow`.
 
     Raises:
       ValueError: if axes differ.
@@ -173,7 +173,7 @@ def optical_flow(
     with one focal length.
     """
     check_shapes(
-        "optical_flow",
+        "induced_flow",
         weights=(weights, "... S"),
         points=(points, "... S 3"),
         flow=(flow, "... S 3"),
@@ -182,4 +182,4 @@ def optical_flow(
     seen = project(camera, expected(weights, points + flow, normalise=normalise))
     visible = seen.in_front & (jnp.sum(weights, axis=-1) > EMPTY)
     landed = jnp.where(visible[..., None], seen.pixels, pixels)
-    return OpticalFlow(flow=landed - pixels, pixels=landed, visible=visible)
+    return InducedFlow(flow=landed - pixels, pixels=landed, visible=visible)

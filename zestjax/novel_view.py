@@ -212,11 +212,11 @@ def _together(system, scene, inputs, height):
 
 def _view_block(system, prediction, scene, inputs):
     p = prediction
-    flow = None if p.dynamic is None else _optical_flow(p, system.place(scene, inputs), inputs.camera)
+    flow = None if p.dynamic is None else _induced_flow(p, system.place(scene, inputs), inputs.camera)
     return View(p.colour, p.static_colour, p.dynamic_colour, p.depth, p.opacity, p.dynamicness, flow)
 
 
-def _optical_flow(prediction, place, camera):
+def _induced_flow(prediction, place, camera):
     """(R, 2) pixels by which the rays' expected points move until the next time; what is static stays."""
     marched = prediction.marched
     moved = place.world(marched.coords + prediction.dynamic.flow_forward)

@@ -17,7 +17,7 @@ from zestjax.base.numerics import matvec
 from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera, centre, intrinsics_inverse
 
-SPACINGS = ("depth", "inverse")
+SPACINGS = ("depth", "inverse")  # what samples are even in: the paper's, and that in which parallax is even
 
 
 class Rays(NamedTuple):

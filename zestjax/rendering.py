@@ -23,7 +23,7 @@ from zestjax.base.numerics import exclusive_cumprod, exclusive_cumsum
 from zestjax.base.types import Array, Tree
 from zestjax.depth import expected_depth
 
-BLEND_FORMS = ("opacity", "density")
+BLEND_FORMS = ("opacity", "density")  # the released code's (and NSFF's), and the one that the paper prints
 
 
 class Rendered(NamedTuple):
@@ -42,8 +42,8 @@ class Rendered(NamedTuple):
 class Blended(NamedTuple):
     """Weights of the two fields that share one ray, each (..., S) and each summing to at most 1.
 
-    Together they sum to at most 1 in the density form, but 4/3 in the opacity form: where both fields are opaque in one
-    sample, both own what reaches it.
+    Together they sum to at most 1 in the density form. In the opacity form they can add up to 4/3: a sample in which
+    both fields are opaque is counted once for each, because neither hides the other inside one sample.
     """
 
     static: jax.Array

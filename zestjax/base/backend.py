@@ -12,7 +12,7 @@ import sys
 import warnings
 from typing import NamedTuple
 
-FLAG = "--xla_cpu_experimental_ynn_fusion_type"
+FLAG = "--xla_cpu_experimental_ynn_fusion_type"  # of the fusion that sums wrongly
 KNOWN = ((0, 10), (0, 13))  # jaxlib from, to: tried on 0.10.0 to 0.12.0; XLA stops the process at a flag that is gone
 LEAST_ROWS = 40_000  # above the 32,768 up to which jaxlib 0.10.2 is right
 LARGEST_ERROR = 1e-4  # relative: the wrong sums are off by 1, right ones by 1e-7

@@ -13,7 +13,7 @@ from zestjax.base.types import T
 
 MOST_NUMBER = 2**16  # of a stored integer: planes, channels or pixels; a larger one is damage
 MOST_ENTRIES = 256  # of a stored list, for the same reason
-MOST_DEPTH = 16  # of parts within parts
+MOST_DEPTH = 16  # of parts within parts: a system has four; Python's own limit would be a traceback
 
 
 @typing.dataclass_transform(frozen_default=True)

@@ -13,7 +13,7 @@ from zestjax.base.trees import tree_cast
 from zestjax.base.types import T
 
 NETWORK = {"float32": jnp.float32, "bfloat16": jnp.bfloat16, "float64": jnp.float64}
-PRECISIONS = tuple(NETWORK)
+PRECISIONS = tuple(NETWORK)  # float64 is for checks: then the geometry beside the network is float64 too
 
 
 def network_at(precision: str, params: T) -> T:

@@ -17,7 +17,7 @@ from zestjax.base.types import Array
 from zestjax.cameras import Camera, project
 from zestjax.resample import bilinear_cells, corner_offsets, gather_corners, interpolate
 
-GAP_LIMIT = 3.0
+GAP_LIMIT = 3.0  # tolerances: beyond, exp(-gap^2) is below 1e-3, and a gap says no more
 
 
 class SourceViews(NamedTuple):

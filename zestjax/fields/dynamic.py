@@ -10,13 +10,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.fields.conditioning import ViewSamples, on_surface, over_views
+from zestjax.fields.conditioning import GAP_LIMIT, ViewSamples, on_surface, over_views
 from zestjax.fields.conditioning import hidden as hidden_behind
 from zestjax.fields.heads import HeadParams, Reading, ViewFeatures
 from zestjax.fields.trunk import Trunk, init_trunk, trunk
 from zestjax.nets.layers import Dense, dense, init_dense, raised
 
-VIEW_FEATURES = 14
+VIEW_FEATURES = 14  # three colours and the eleven scalars of `dynamic_views`
 SUMMARIES = 4  # and two more of every slot
 HEARSAY = 0.02  # weight of a slot that sees a point but not as what moves: a last resort where no slot does
 EARLY_WIDTH = 24  # of the net that finds the early flow
@@ -90,10 +90,10 @@ def dynamic_views(samples: ViewSamples, times: jax.Array) -> ViewFeatures:
     weights = support + HEARSAY * samples.visible * (1 - behind)
     deviation = samples.colour - over_views(weights, samples.colour)[None]
     size = jnp.sum(jnp.abs(deviation), axis=1)
-    through = samples.visible * jnp.square(jnp.minimum(samples.gap, 0) / 3)
+    through = samples.visible * jnp.square(jnp.minimum(samples.gap, 0) / GAP_LIMIT)
     wide = lambda x: jnp.broadcast_to(x[:, None], size.shape)
     scalars = [
-        size, samples.visible, samples.moving, agree, behind, through, support, samples.gap / 3,
+        size, samples.visible, samples.moving, agree, behind, through, support, samples.gap / GAP_LIMIT,
         samples.moving * through, wide(jnp.exp(-jnp.abs(times))), wide(jnp.tanh(times)),
     ]  # fmt: skip
     features = jnp.concatenate([4 * deviation, jnp.stack(scalars, 1)], 1)

@@ -10,14 +10,14 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.numerics import added
-from zestjax.fields.conditioning import ViewSamples, on_surface, over_views
+from zestjax.fields.conditioning import GAP_LIMIT, ViewSamples, on_surface, over_views
 from zestjax.fields.conditioning import hidden as hidden_behind
 from zestjax.fields.heads import HeadParams, Reading, ViewFeatures
 from zestjax.fields.trunk import Trunk, init_trunk, trunk
 from zestjax.nets.layers import Dense, dense, init_dense, raised
 
-VIEW_FEATURES = 13
-SUMMARIES = 5
+VIEW_FEATURES = 13  # three colours and the ten scalars of `static_views`
+SUMMARIES = 5  # means of three features over the views, and how many views can be trusted, and are near
 
 
 class StaticParams(NamedTuple):
@@ -67,9 +67,10 @@ def static_views(samples: ViewSamples, shift: jax.Array, times: jax.Array) -> Vi
     weights = samples.visible * (1 - samples.moving) * (1 - behind)
     mean = over_views(weights, samples.colour)
     size = jnp.sum(jnp.abs(samples.colour - mean[None]), axis=1)
+    # A view that is 0.3 (summed over the channels) off the mean is an outlier: a guess that was never varied.
     robust = weights * jnp.exp(-jnp.square(size / 0.3)) / (1 + shift)
     second = samples.colour - over_views(robust, samples.colour)[None]
-    through = samples.visible * (1 - samples.moving) * jnp.square(jnp.minimum(samples.gap, 0) / 3)
+    through = samples.visible * (1 - samples.moving) * jnp.square(jnp.minimum(samples.gap, 0) / GAP_LIMIT)
     near = jnp.broadcast_to(jnp.exp(-jnp.abs(times) / 4)[:, None], size.shape)
     scalars = [
         size, jnp.sum(jnp.abs(second), 1), samples.visible, samples.moving, agree, behind, through,

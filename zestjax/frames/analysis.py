@@ -24,14 +24,16 @@ from zestjax.nets.layers import raised
 from zestjax.nets.unet2d import UNet2d, init_unet2d, unet2d
 
 STILL_COSTS, MOVING_COSTS = 6, 2  # static, best and still; moving; and each averaged over its surroundings
-COSTS = STILL_COSTS + MOVING_COSTS
-SURROUNDINGS = 5  # cells
+COSTS = STILL_COSTS + MOVING_COSTS  # all, the static ones first
+SURROUNDINGS = 5  # cells, 20 pixels: the side of the square that costs are averaged over; a guess that was never varied
 GAIN = 3.0  # nats between the least and the greatest of a cost, before anything is learned
-SUMMARIES = 2 * COSTS + 4
+SUMMARIES = 2 * COSTS + 4  # the least of each cost and its plane; ground and what stands, for both of `STANDING`
 STATIC_AROUND = 3  # of the costs, the static one averaged over its surroundings
-STANDING = (0.25, 0.5)  # static costs above which a cell is taken to be what moves, when looking for what it stands on
+# Static cost above which a cell is taken to move, where what it stands on is looked for. Two, as one suits textured
+# scenes and the other flat ones: a guess that was never varied.
+STANDING = (0.25, 0.5)
 MOVING_PARTS = 4  # a mask value for each half-resolution pixel of a cell
-NEVER = -30.0  # logit of moving where nothing does
+NEVER = -30.0  # logit of moving where nothing does: a probability of 1e-13, and finite
 MOST_PLANES, MOST_WIDTH, MOST_LEVELS = 512, 4096, 8  # of a network that fits a machine, whoever wrote its file
 
 
@@ -165,10 +167,12 @@ def frame_maps(params: AnalysisParams, evidence: Evidence, *, still: bool = Fals
     standing = still_free - functools.reduce(operator.add, believed[:STILL_COSTS])
     moved = moving_free - functools.reduce(operator.add, believed[STILL_COSTS:])
     moving = jnp.full_like(moving, NEVER) if still else moving
+    # About 7 nats from one end of the planes to the other, before anything is learned.
     moved = moved - 10 * jax.nn.softplus(4 * sharpness) * away
     moves = jnp.mean(moving, axis=-1, keepdims=True)
     logits = _mixed(standing, moved, moves)
-    # The surface is that of the likelier kind: of the two, a sharp one would win the mixture's mode against a sure one.
+    # The mode of the likelier of the two distributions, not of their mixture: there, a narrow peak of small weight can
+    # be the highest point.
     coordinate, tolerance = plane_moments(jnp.where(moves > 0, moved, standing))
     v, h, w, _ = moving.shape
     moving = jnp.moveaxis(moving.reshape(v, h, w, 2, 2), 3, 2).reshape(v, 2 * h, 2 * w)
@@ -202,5 +206,6 @@ def plane_moments(logits: Array, *, reach: int = 2) -> tuple[jax.Array, jax.Arra
     variance = jnp.sum(probability * (index - mean[..., None]) ** 2, axis=-1)
     whole = jax.nn.softmax(logits, axis=-1)
     outside = 1 - jnp.sum(jnp.where(near, whole, 0), axis=-1)
+    # At least 0.7 planes, as a surface may lie between two; two more where all of the mass is elsewhere.
     tolerance = (0.7 + jnp.sqrt(variance + 1e-6) + 2 * outside) / (planes - 1)
     return mean / (planes - 1), tolerance

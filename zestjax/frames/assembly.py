@@ -16,11 +16,11 @@ from zestjax.base.checks import traced
 from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera
 from zestjax.frames.cells import half_images
-from zestjax.frames.evidence import Evidence, Neighbours, Sources, frame_evidence
+from zestjax.frames.evidence import Evidence, MatchingViews, Neighbours, frame_evidence
 from zestjax.frames.optical_flow import VideoFlow, video_flow
-from zestjax.frames.selection import Chosen, key_frames, slots
+from zestjax.frames.selection import Chosen, key_frames, neighbours
 
-EVIDENCE_SOURCES = 8
+EVIDENCE_SOURCES = 8  # frames that one is compared with, as many as a target has key-frames; never varied
 
 
 def positions(cameras: Camera) -> Array:
@@ -65,7 +65,7 @@ def _evidence(image, camera, sources, neighbours, near, far, *, planes):
 
 
 def video_evidence(
-    footage: Footage,
+    seen: Footage,
     cameras: Camera,
     near: Scalar,
     far: Scalar,
@@ -77,7 +77,7 @@ def video_evidence(
     """`Evidence` of frames of a video, quantised to uint8 (1/255 of the truncation), on the host.
 
     Args:
-      footage: `Footage` of N frames.
+      seen: `Footage` of N frames.
       cameras: `Camera` (N, ...) on the host, of full-size images.
       near: world units.
       far: world units.
@@ -88,15 +88,15 @@ def video_evidence(
     Returns:
       `Evidence` of uint8 numpy arrays, leading axis `frames`.
     """
-    half, (flow, sure) = footage
+    half, (flow, sure) = seen
     places = positions(cameras)
     found = []
     for i in range(len(half)) if frames is None else frames:
         chosen, around = _compared(places, i, exclude)
-        sources = Sources(half[chosen.frames], taken(cameras, chosen.frames), chosen.valid)
-        neighbours = Neighbours(flow[i], sure[i] * around.valid[:, None, None], taken(cameras, around.frames))
+        sources = MatchingViews(half[chosen.frames], taken(cameras, chosen.frames), chosen.valid)
+        beside = Neighbours(flow[i], sure[i] * around.valid[:, None, None], taken(cameras, around.frames))
         bounds = np.float32(near), np.float32(far)
-        found.append(_evidence(half[i], taken(cameras, i), sources, neighbours, *bounds, planes=planes))
+        found.append(_evidence(half[i], taken(cameras, i), sources, beside, *bounds, planes=planes))
     return jax.tree.map(lambda *rows: np.stack([np.asarray(r) for r in rows]), *found)
 
 
@@ -106,7 +106,7 @@ def _compared(places, frame, exclude):
     if others.issuperset(range(len(places))):
         return tuple(Chosen(np.full(n, frame), np.zeros(n, np.float32)) for n in (EVIDENCE_SOURCES, 2))
     chosen = key_frames(places, EVIDENCE_SOURCES, target=places[frame], time=frame, exclude=others)
-    return chosen, slots(len(places), frame, offsets=(1, -1), exclude=others)
+    return chosen, neighbours(len(places), frame, offsets=(1, -1), exclude=others)
 
 
 def dequantised(evidence: Evidence) -> Evidence:

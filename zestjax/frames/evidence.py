@@ -22,8 +22,8 @@ from zestjax.frames.cells import cell_values, pooled
 from zestjax.planesweep import homographies, plane_depths
 from zestjax.resample import bilinear
 
-TRUNCATION = 0.15
-GAP = 4.0
+TRUNCATION = 0.15  # colour difference from which a source says only that it differs: a guess that was never varied
+GAP = 4.0  # pixels between two flows from which they only differ, about a cell: a guess that was never varied
 FLOW_RANGE = 64.0  # pixels of flow, beyond what the far plane has, that the flow channels span either way
 FLOW_CHANNELS = 16  # at the four half-resolution pixels of a cell, to both neighbours
 
@@ -49,7 +49,7 @@ class Evidence(NamedTuple):
     colours: Array
 
 
-class Sources(NamedTuple):
+class MatchingViews(NamedTuple):
     """Frames to compare with: half-resolution images (J, 2h, 2w, 3), `Camera` of full size (J, ...), valid (J,)."""
 
     images: Array
@@ -78,7 +78,7 @@ def _carried(homography, grid):
     return points[..., :2] / jnp.where(front, points[..., 2], 1)[..., None], front
 
 
-def static_costs(reference: Array, sources: Sources, hom: Array) -> tuple[jax.Array, jax.Array]:
+def static_costs(reference: Array, sources: MatchingViews, hom: Array) -> tuple[jax.Array, jax.Array]:
     """(h, w) mean cost over the valid sources at one plane, and over their better half; hom (J, 3, 3) between
     half-resolution pixels of the reference (2h, 2w, 3) and the sources."""
     grid = _grid(reference.shape[0], reference.shape[1], reference.dtype)
@@ -146,14 +146,21 @@ def _flow_channels(neighbours, hom):
 
 
 def frame_evidence(
-    image: Array, camera: Camera, sources: Sources, neighbours: Neighbours, near: Scalar, far: Scalar, *, planes: int
+    image: Array,
+    camera: Camera,
+    sources: MatchingViews,
+    neighbours: Neighbours,
+    near: Scalar,
+    far: Scalar,
+    *,
+    planes: int,
 ) -> Evidence:
     """Evidence of one frame.
 
     Args:
       image: (2h, 2w, 3) the frame at half resolution (`half_images`).
       camera: its `Camera`, of the full-size image.
-      sources: `Sources` for the static cost.
+      sources: `MatchingViews` for the static cost.
       neighbours: `Neighbours`.
       near: () world units.
       far: () world units.

@@ -15,7 +15,7 @@ from zestjax.cameras import Camera, check_camera
 from zestjax.video import Video, check_video
 
 ROUNDING = 1e-9  # a gap between two views, as a share of their extent, that float64 may have made
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # of a camera's y and z axis: OpenGL's to OpenCV's, and back
 OPENGL = (
     "OpenGL's (y up, z backward), change the signs of the second and third row of a camera_from_world; "
     "`cameras.camera_from_opengl_pose` takes a world_from_camera"

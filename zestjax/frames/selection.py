@@ -17,6 +17,7 @@ from zestjax.base.parts import part
 from zestjax.base.types import Array
 from zestjax.video import Frames, Inputs
 
+# The nearest frames, and some further ones that see round corners: a guess that was never varied.
 RANKS = (0, 1, 2, 3, 4, 6, 8, 11)
 CHOICES = ("nearest", "spread")
 MOST_FRAMES = 64  # that serve one target: a file of weights may not ask for more
@@ -89,7 +90,7 @@ def key_frames(
     return _filled(usable[order][ranks], count)
 
 
-def slots(frames: int, time: int | Array, *, offsets: Sequence[int], exclude: Collection[int] = ()) -> Chosen:
+def neighbours(frames: int, time: int | Array, *, offsets: Sequence[int], exclude: Collection[int] = ()) -> Chosen:
     """The neighbours of a time: frames time + offsets, each with a validity bit.
 
     Source: ZeST-NeRF section 3.1 (M neighbours of the target frame).
@@ -136,7 +137,7 @@ class KeyFrames:
 
 @part
 class Slots:
-    """Serves what moves: the frames at these offsets from the target's time, see `slots`."""
+    """Serves what moves: the frames at these offsets from the target's time, see `neighbours`."""
 
     offsets: tuple[int, ...] = (-2, -1, 0, 1, 2)
 
@@ -152,7 +153,7 @@ class Slots:
 
     def choose(self, positions: Array, *, time: int | Array, exclude: Collection[int] = ()) -> Chosen:
         """Which frames of a video serve a target."""
-        return slots(len(positions), time, offsets=self.offsets, exclude=exclude)
+        return neighbours(len(positions), time, offsets=self.offsets, exclude=exclude)
 
     def of(self, inputs: Inputs) -> Frames:
         """Those of a target's inputs."""

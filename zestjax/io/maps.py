@@ -17,7 +17,7 @@ from zestjax.io.pictures import check_fits, doubted_mask, mask_warning, resize_n
 from zestjax.io.reading import FileWarning, check_numbers, read_array, read_arrays
 
 
-class Flow(NamedTuple):
+class FlowMaps(NamedTuple):
     """Optical flow of every frame. vectors: (N, H, W, 2) pixels, 0 where not valid. valid: (N, H, W) bool."""
 
     vectors: np.ndarray
@@ -50,8 +50,8 @@ def masks_of(record: Record, size: tuple[int, int]) -> np.ndarray | None:
     return masks
 
 
-def flow_of(record: Record, files: Mapping[int, Path], size: tuple[int, int]) -> Flow | None:
-    """`Flow` of the frames, not valid where a frame has no file; None when none has."""
+def flow_of(record: Record, files: Mapping[int, Path], size: tuple[int, int]) -> FlowMaps | None:
+    """`FlowMaps` of the frames, not valid where a frame has no file; None when none has."""
     if not files:
         return None
     count = len(record.images)
@@ -62,7 +62,7 @@ def flow_of(record: Record, files: Mapping[int, Path], size: tuple[int, int]) ->
         flow = resize_nearest(stored, *size) * _flow_scale(stored.shape, size)
         valid[i] &= np.isfinite(flow).all(-1)
         vectors[i] = np.where(valid[i][..., None], flow, 0)
-    return Flow(vectors, valid)
+    return FlowMaps(vectors, valid)
 
 
 def _stored_flow(record, path):

@@ -28,7 +28,7 @@ from zestjax.frames.inputs import check_inputs
 from zestjax.io.idr import is_idr, read_idr
 from zestjax.io.layouts import select
 from zestjax.io.llff import is_llff, read_llff
-from zestjax.io.maps import Flow, disparity_of, flow_of, masks_of, truth_of
+from zestjax.io.maps import FlowMaps, disparity_of, flow_of, masks_of, truth_of
 from zestjax.io.nrnerf import is_nrnerf, read_nrnerf
 from zestjax.io.nsff import is_nsff, read_nsff
 from zestjax.io.pictures import SUFFIXES, image_size, read_image, read_mask, resize_area, resize_nearest
@@ -83,16 +83,16 @@ class Scene:
     """A scene in memory, as numpy arrays.
 
     name, layout: str. video: `Video`. targets: sequence of `Target`, which may read them as it goes. motion_masks:
-    (N, H, W) bool. flow_forward, flow_backward: `Flow`. disparity: (N, H, W), up to scale and shift. stored: (height,
-    width) of the first picture's file. What a scene lacks is None.
+    (N, H, W) bool. flow_forward, flow_backward: `FlowMaps`. disparity: (N, H, W), up to scale and shift. stored:
+    (height, width) of the first picture's file. What a scene lacks is None.
     """
 
     name: str
     video: Video
     targets: Sequence[Target]
     motion_masks: np.ndarray | None = None
-    flow_forward: Flow | None = None
-    flow_backward: Flow | None = None
+    flow_forward: FlowMaps | None = None
+    flow_backward: FlowMaps | None = None
     disparity: np.ndarray | None = None
     layout: str = ""
     stored: tuple[int, int] | None = None

@@ -4,9 +4,9 @@ nearest frame   the input nearest in time, then in camera position, unchanged
 plane warp      the neighbours warped to the target by the one fronto-parallel plane on which they agree best
 
 N        frames of the video
-V        neighbours of a time, one per slot
+V        neighbours of a time, one per offset
 H W      rows and columns of the frames, and of the prediction
-slot     a neighbour's time minus the target's
+offset   a neighbour's time minus the target's
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from zestjax.cameras import Camera, centre
 from zestjax.planesweep import homographies, plane_depths, warp
 from zestjax.video import Video
 
-SLOTS = (-2, -1, 0, 1, 2)
+OFFSETS = (-2, -1, 0, 1, 2)  # the neighbours that the systems' dynamic fields have
 LEAST_OVERLAP = 0.5
 """A plane competes when at least this share of the most overlap any plane has remains: agreeing on a sliver is luck."""
 
@@ -88,12 +88,12 @@ def plane_warp(
     time: int | Array,
     *,
     exclude: Sequence[int] | Array = (),
-    slots: Sequence[int] = SLOTS,
+    offsets: Sequence[int] = OFFSETS,
     planes: int = 32,
 ) -> PlaneWarped:
     """The valid neighbours, warped by the plane on which they agree best and averaged where they see.
 
-    A neighbour is valid when its time exists, it is not excluded, and at slot 0 it is another camera's picture.
+    A neighbour is valid when its time exists, it is not excluded, and at offset 0 it is another camera's picture.
     Neighbours agree by the mean squared difference of their colours, over the pairs that see a pixel and over the
     pixels; the planes are regular in inverse depth.
 
@@ -104,7 +104,7 @@ def plane_warp(
       camera: the target's `Camera`, no batch axes; the prediction has the size of the frames.
       time: () frame index of the target, an integer or a traced one.
       exclude: indices of frames that may not be used: a sequence or an integer array, both free to repeat.
-      slots: times of the neighbours minus the target's.
+      offsets: times of the neighbours minus the target's.
       planes: how many depths are tried between the video's near and far.
 
     Returns:
@@ -114,7 +114,7 @@ def plane_warp(
       ValueError: shapes do not match, or every frame is excluded.
     """
     available = _available("plane_warp", video, exclude)
-    frames, valid = _neighbours(video, camera, time, available, slots)
+    frames, valid = _neighbours(video, camera, time, available, offsets)
     depths = plane_depths(video.near, video.far, planes, spacing="inverse")
     carry = homographies(camera, frames.cameras, depths)
 
@@ -138,16 +138,16 @@ class _Frames(NamedTuple):
     cameras: Camera
 
 
-def _neighbours(video, camera, time, available, slots):
-    """The frames at the slots (V, ...) and which of them are valid (V,)."""
+def _neighbours(video, camera, time, available, offsets):
+    """The frames at the offsets (V, ...) and which of them are valid (V,)."""
     count = video.images.shape[0]
-    times = jnp.asarray(time) + jnp.asarray(slots)
+    times = jnp.asarray(time) + jnp.asarray(offsets)
     index = jnp.clip(times, 0, count - 1)
     cameras = jax.tree.map(lambda leaf: leaf[index], video.cameras)
     moved = jnp.max(jnp.abs(cameras.camera_from_world - camera.camera_from_world[None]), axis=(1, 2))
     zoomed = jnp.max(jnp.abs(cameras.intrinsics - camera.intrinsics[None]), axis=(1, 2))
     other_camera = (moved > 1e-6) | (zoomed > 1e-3)
-    valid = (times == index) & available[index] & ((jnp.asarray(slots) != 0) | other_camera)
+    valid = (times == index) & available[index] & ((jnp.asarray(offsets) != 0) | other_camera)
     return _Frames(video.images[index], cameras), valid
 
 

@@ -19,10 +19,11 @@ from zestjax.base.types import Array
 from zestjax.metrics import mean_where
 from zestjax.nets.layers import Conv
 
+# AlexNet's, as LPIPS takes it: (size of the kernel, channels in, channels out).
 LAYERS = ((11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256))
 STRIDES, PADDING = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 POOLED = (1, 2)  # layers whose input is pooled
-LEAST_SIDE = 31
+LEAST_SIDE = 31  # pixels, of which the second pooling leaves one place
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of inputs in [-1, 1], as the heads were trained
 IMAGES = ("NHWC", "HWIO", "NHWC")
 

@@ -19,7 +19,7 @@ from zestjax.base.numerics import masked_mean
 from zestjax.base.types import Array
 
 NORMS = {"absolute": jnp.abs, "squared": jnp.square}
-NORMALISERS = ("count", "confidence")
+NORMALISERS = ("count", "confidence")  # of a mean weighted by confidence; the released code has the second
 
 
 def spread_mask(where: str, name: str, mask: Array | None, shape: Sequence[int]) -> jax.Array:

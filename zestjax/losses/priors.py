@@ -21,7 +21,7 @@ def geometric_loss(pixels: Array, target_pixels: Array, *, valid: Array | None =
     Reference: ZeST-NeRF train.py; in pixels, not divided by the image's size.
 
     Args:
-      pixels: (..., 2), from `flow.optical_flow`.
+      pixels: (..., 2), from `flow.induced_flow`.
       target_pixels: (..., 2) the ray's pixel plus the prior's optical flow.
       valid: (...) where the prior is consistent, the neighbour exists and the point is visible.
 

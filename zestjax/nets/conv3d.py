@@ -19,7 +19,7 @@ from zestjax.base.checks import check_option, check_shapes
 
 VOLUMES = ("NDHWC", "DHWIO", "NDHWC")
 IMAGES = ("NHWC", "HWIO", "NHWC")
-LOWERINGS = ("auto", "plain", "folded")
+LOWERINGS = ("auto", "plain", "folded")  # see `conv3d`: XLA's 3-D convolutions are slow on a CPU
 # PARITY[s, p, i] is 1 where tap i takes input j + s to output 2 j + p of a transposed convolution, on one axis.
 PARITY = np.zeros((2, 2, 3))
 PARITY[0, 0, 1] = PARITY[0, 1, 2] = PARITY[1, 1, 0] = 1

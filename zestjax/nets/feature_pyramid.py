@@ -9,7 +9,8 @@ from zestjax.base.checks import check_option, check_shapes
 from zestjax.base.types import Array
 from zestjax.nets.layers import Block, Conv, block2d, conv2d, init_block2d, init_conv2d, raised
 
-STRIDES = (1, 1, 2, 1, 1, 2, 1, 1)
+STRIDES = (1, 1, 2, 1, 1, 2, 1, 1)  # the paper's table: two halvings make the quarter that volumes have
+# Of RGB in [0, 1], as torchvision's networks, and so MVSNeRF's published weights, expect them.
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
 

@@ -19,7 +19,7 @@ from zestjax.base.checks import check_option, check_shapes
 from zestjax.base.numerics import matmul
 from zestjax.nets.conv2d import convolve2d
 
-FEW_ROWS = 4096  # of a norm's statistics
+FEW_ROWS = 4096  # of a norm's statistics, of which a mean may be a product: its error grows with them, see `_mean`
 
 
 class Dense(NamedTuple):

@@ -15,9 +15,9 @@ from zestjax.simulate.layout import Layout
 from zestjax.simulate.textures import random_atlas
 from zestjax.simulate.types import Effects, SimulatedScene
 
-FRAMES = 24
-SHADOWS = {"shadows": np.float32(0.6)}
-MIDDLE = (FRAMES - 1) / 2
+FRAMES = 24  # as many as a scene of the Dynamic Scene dataset has in ZeST-NeRF's setting: two rounds of the rig
+SHADOWS = {"shadows": np.float32(0.6)}  # part of the benchmark, as all numbers below: changed, its figures are others
+MIDDLE = (FRAMES - 1) / 2  # the time at which what moves passes its place
 
 
 @dataclass(frozen=True)

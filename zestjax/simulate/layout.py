@@ -12,7 +12,7 @@ import numpy as np
 
 from zestjax.simulate.types import Bodies, Effects, Motion, Scene
 
-BOXES, BALLS = 20, 10
+BOXES, BALLS = 20, 10  # rows of a scene's tables, so that all scenes share one program: room and the largest crowd fit
 
 
 class Body(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zestjax.simulate.layout import Layout, sized
-from zestjax.simulate.textures import SLOTS
+from zestjax.simulate.textures import TEXTURES
 
 
 class View(NamedTuple):
@@ -41,7 +41,7 @@ def finish(chance: np.random.Generator, view: View, z: float, size: float) -> di
     tint = chance.uniform(0.65, 1.1) * chance.uniform(0.85, 1.1, 3)
     gloss = chance.uniform(0, 0.6) if chance.random() < 0.3 else 0.0
     return dict(
-        textures=(int(chance.integers(SLOTS)),), tile=tile, offset=chance.uniform(0, 2, 2), tint=tint, gloss=gloss
+        textures=(int(chance.integers(TEXTURES)),), tile=tile, offset=chance.uniform(0, 2, 2), tint=tint, gloss=gloss
     )
 
 
@@ -59,7 +59,7 @@ def add_room(
     depth = (view.reach + behind) / 2
     height = (view.floor + ceiling) / 2
     middle = np.array([0, (view.floor - ceiling) / 2, view.reach - depth])
-    walls = tuple(int(i) for i in chance.choice(SLOTS, 3, replace=False))
+    walls = tuple(int(i) for i in chance.choice(TEXTURES, 3, replace=False))
     look = dict(tint=chance.uniform(0.8, 1.1, 3), offset=chance.uniform(0, 2, 2))
     tile = view.width(view.reach) * chance.uniform(0.25, 0.8)
     layout.box(
@@ -69,7 +69,7 @@ def add_room(
     near_tile = view.width(view.floor / view.down) * chance.uniform(0.5, 1.6)
     layout.box(
         shape=sized((2 * half_width, 0.5, 2 * depth)), position=(middle[0], view.floor + 0.5, middle[2]),
-        textures=(int(chance.integers(SLOTS)),), tile=near_tile, offset=chance.uniform(0, 2, 2), **motion,
+        textures=(int(chance.integers(TEXTURES)),), tile=near_tile, offset=chance.uniform(0, 2, 2), **motion,
     )  # fmt: skip
 
 

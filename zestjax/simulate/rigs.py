@@ -10,7 +10,7 @@ import numpy as np
 
 from zestjax.cameras import Camera
 
-RIG = 12
+RIG = 12  # cameras, as the rig of the Dynamic Scene dataset has
 
 
 def intrinsics_from_view(height: int, width: int, tangent: float) -> np.ndarray:

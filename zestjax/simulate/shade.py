@@ -56,12 +56,12 @@ def _texel_range(coordinate, side):
     return jnp.maximum(first, 0), jnp.minimum(first + 1, side - 1), place - low
 
 
-def texel(atlas: Array, slot: Array, u: Array, v: Array, level: Array) -> tuple[jax.Array, ...]:
+def texel(atlas: Array, texture: Array, u: Array, v: Array, level: Array) -> tuple[jax.Array, ...]:
     """Bilinear lookup of a packed atlas.
 
     Args:
       atlas: (T,) uint32.
-      slot: (R) int32.
+      texture: (R) int32.
       u: (R) tiles across, mirrored beyond [0, 1].
       v: (R) tiles down, likewise.
       level: (R) int32 times the tiles are halved.
@@ -69,10 +69,10 @@ def texel(atlas: Array, slot: Array, u: Array, v: Array, level: Array) -> tuple[
     Returns:
       colour, a vector of (R) in [0, 1].
     """
-    slots = atlas.shape[0] // sum((TILE >> k) ** 2 for k in range(LEVELS))
-    starts = jnp.asarray([slots * sum((TILE >> k) ** 2 for k in range(n)) for n in range(LEVELS)], jnp.int32)
+    textures = atlas.shape[0] // sum((TILE >> k) ** 2 for k in range(LEVELS))
+    starts = jnp.asarray([textures * sum((TILE >> k) ** 2 for k in range(n)) for n in range(LEVELS)], jnp.int32)
     side = jnp.right_shift(jnp.int32(TILE), level)
-    base = starts[level] + slot * side * side
+    base = starts[level] + texture * side * side
     top, bottom, down = _texel_range(v, side)
     left, right, across = _texel_range(u, side)
     corners = ((top, left, (1 - down) * (1 - across)), (top, right, (1 - down) * across))
@@ -88,11 +88,11 @@ def albedo(scene: Scene, bodies: Bodies, seen: Surface, footprint: Array) -> tup
     q = [seen.local[i] * bodies.tiling[:, i][seen.body] for i in range(3)]
     u = jnp.where(seen.face == 0, q[2], q[0]) + bodies.offset[:, 0][seen.body]
     v = jnp.where(seen.face == 1, q[2], q[1]) + bodies.offset[:, 1][seen.body]
-    slot = bodies.texture.reshape(-1)[3 * seen.body + seen.face]
+    texture = bodies.texture.reshape(-1)[3 * seen.body + seen.face]
     extent = jnp.sqrt(jnp.sum(bodies.shape[:, :3, :3] ** 2, axis=1))
     density = jnp.max(bodies.tiling / extent, axis=1)[seen.body] * TILE
     level = jnp.clip(jnp.round(jnp.log2(jnp.maximum(footprint * density, 1e-6))), 0, LEVELS - 1).astype(jnp.int32)
-    return tuple(c * bodies.tint[:, i][seen.body] for i, c in enumerate(texel(scene.atlas, slot, u, v, level)))
+    return tuple(c * bodies.tint[:, i][seen.body] for i, c in enumerate(texel(scene.atlas, texture, u, v, level)))
 
 
 def shaded(

@@ -1,6 +1,6 @@
 """Textures from scikit-image's bundled photographs and from procedural patterns, drawn on the host.
 
-A scene carries its textures as an atlas: `SLOTS` square tiles with their halved copies (mip levels), packed
+A scene carries its textures as an atlas: `TEXTURES` square tiles with their halved copies (mip levels), packed
 into one uint32 a texel so that a lookup is one gather of one word. Training and zest-bench draw from
 disjoint photographs, and from procedural patterns of different seeds.
 """
@@ -13,8 +13,8 @@ import numpy as np
 import skimage
 
 TILE = 256  # texels along a tile's side at level 0
-LEVELS = 6
-SLOTS = 12
+LEVELS = 6  # of halved copies: the last has 8 texels a side, for what is far
+TEXTURES = 12  # of an atlas: room, props and movers rarely share one; 12 tiles with their copies take 4 MB
 PHOTOGRAPHS = {
     "training": (
         ("astronaut.png", "coffee.png", "ihc.png", "gravel.png", "camera.png", "moon.png")
@@ -128,6 +128,6 @@ def packed_atlas(tiles: np.ndarray) -> np.ndarray:
     return np.concatenate(levels)
 
 
-def random_atlas(chance: np.random.Generator, split: str, *, slots: int = SLOTS) -> np.ndarray:
-    """(T,) uint32 packed atlas of `slots` random textures of one split."""
-    return packed_atlas(np.stack([random_tile(chance, split) for _ in range(slots)]))
+def random_atlas(chance: np.random.Generator, split: str, *, textures: int = TEXTURES) -> np.ndarray:
+    """(T,) uint32 packed atlas of `textures` random textures of one split."""
+    return packed_atlas(np.stack([random_tile(chance, split) for _ in range(textures)]))

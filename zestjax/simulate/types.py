@@ -46,7 +46,7 @@ class Bodies(NamedTuple):
     shape: (B, 4, 4) joint_from_unit, affine and never singular.
     present: (B,) bool; an absent body is seen by no ray.
     hollow: (B,) bool; seen from inside, casts no shadow: the room around a scene.
-    texture: (B, 3) int32 atlas slot of the faces across x, y and z.
+    texture: (B, 3) int32 number in the atlas of the texture of the faces across x, y and z.
     tiling: (B, 3) texture tiles per unit-body half-length.
     offset: (B, 2) texture tiles.
     tint: (B, 3) factor on the texture.

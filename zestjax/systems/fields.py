@@ -120,12 +120,12 @@ class Static(Choices):
         """Parameters."""
         volume, net = jax.random.split(key)
         sizes = sizes_of(self, axes=3, features=static.VIEW_FEATURES, summaries=static.SUMMARIES)
-        swept = None if self.volume is None else self.volume.init(volume, views=self.frames.count, slots=False)
+        swept = None if self.volume is None else self.volume.init(volume, views=self.frames.count, motion_votes=False)
         return FieldParams(swept, static.init_static(net, **sizes))
 
     def encode(self, params, inputs, maps, frustum, depths):
         """See `Field`. Source: ZeST-NeRF eq. 2."""
-        return encoded(self, params, inputs, maps, frustum, depths, slots=False)
+        return encoded(self, params, inputs, maps, frustum, depths, motion_votes=False)
 
     def __call__(self, params, seen, marched, place):
         """See `Field`."""
@@ -157,13 +157,13 @@ class Dynamic(Choices):
         volume, net = jax.random.split(key)
         summaries = dynamic.SUMMARIES + 2 * self.frames.count
         sizes = sizes_of(self, axes=4, features=dynamic.VIEW_FEATURES, summaries=summaries)
-        swept = None if self.volume is None else self.volume.init(volume, views=self.frames.count, slots=True)
+        swept = None if self.volume is None else self.volume.init(volume, views=self.frames.count, motion_votes=True)
         channels = 0 if self.volume is None else self.volume.channels
         return FieldParams(swept, dynamic.init_dynamic(net, n_volume=channels, looks=self.head.looks, **sizes))
 
     def encode(self, params, inputs, maps, frustum, depths):
         """See `Field`. Source: ZeST-NeRF eq. 3."""
-        return encoded(self, params, inputs, maps, frustum, depths, slots=True)
+        return encoded(self, params, inputs, maps, frustum, depths, motion_votes=True)
 
     def __call__(self, params, seen, marched, place):
         """See `Field`. Time is normalised to [-1, 1) over the video (reference: ZeST-NeRF networks.py)."""
@@ -221,12 +221,12 @@ def sizes_of(field: Choices, *, axes: int, features: int, summaries: int) -> dic
     )
 
 
-def encoded(field: Choices, params, inputs, maps, frustum, depths, *, slots: bool) -> Seen:
+def encoded(field: Choices, params, inputs, maps, frustum, depths, *, motion_votes: bool) -> Seen:
     """What a field with a `Swept` volume reads of a target."""
     if field.volume is None:
         return Seen(None, None)
     frames = field.frames.of(inputs)
-    volume = field.volume.encode(params.volume, frames, maps, inputs, frustum, depths, slots=slots)
+    volume = field.volume.encode(params.volume, frames, maps, inputs, frustum, depths, motion_votes=motion_votes)
     return Seen(volume, field.volume.tables.views(frames, maps, inputs))
 
 

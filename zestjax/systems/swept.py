@@ -121,12 +121,12 @@ class Swept:
         """What a look-up gives."""
         return self.widths[0] + self.occupied
 
-    def init(self, key: jax.Array, *, views: int, slots: bool) -> VolumeParams:
-        """Parameters, for that many source frames; slots: votes are kept slot by slot."""
+    def init(self, key: jax.Array, *, views: int, motion_votes: bool) -> VolumeParams:
+        """Parameters, for that many source frames; motion_votes: votes are kept slot by slot."""
         features = self.tables.channels
         return init_volume(
             key, features=features, views=views, widths=self.widths, colours=self.tables.colours,
-            trusted=self.tables.trusted, slots=slots, occupied=self.occupied,
+            trusted=self.tables.trusted, motion_votes=motion_votes, occupied=self.occupied,
             pyramid_widths=(features // 4, features // 2, features) if features else None,
         )  # fmt: skip
 
@@ -139,11 +139,11 @@ class Swept:
         frustum: Frustum,
         depths: jax.Array,
         *,
-        slots: bool,
+        motion_votes: bool,
     ) -> Volume:
         """The volume that fills a frustum, on planes at `depths`."""
         views = self.tables.sweep(params, frames, maps, inputs)
         return encode_volume(
             params, views, frustum.camera, (frustum.height, frustum.width), depths,
-            colours=self.tables.colours, trusted=self.tables.trusted, slots=slots,
+            colours=self.tables.colours, trusted=self.tables.trusted, motion_votes=motion_votes,
         )  # fmt: skip

@@ -50,8 +50,8 @@ def contains(closed: ClosedJaxpr | Jaxpr, name: str) -> bool:
     )
 
 
-def _jaxpr(program):
-    return program.jaxpr if isinstance(program, ClosedJaxpr) else program
+def _jaxpr(closed):
+    return closed.jaxpr if isinstance(closed, ClosedJaxpr) else closed
 
 
 def inner_programs(equation: JaxprEqn) -> list[ClosedJaxpr | Jaxpr]:
@@ -62,8 +62,8 @@ def inner_programs(equation: JaxprEqn) -> list[ClosedJaxpr | Jaxpr]:
     ]  # fmt: skip
 
 
-def _run(program, leaves, visit, taken):
-    jaxpr, consts = _jaxpr(program), program.consts if isinstance(program, ClosedJaxpr) else ()
+def _run(closed, leaves, visit, taken):
+    jaxpr, consts = _jaxpr(closed), closed.consts if isinstance(closed, ClosedJaxpr) else ()
     known = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(zip(jaxpr.invars, leaves, strict=True))
     read = lambda variable: variable.val if isinstance(variable, Literal) else known[variable]
     for equation in jaxpr.eqns:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax.cameras import project, unproject
-from zestjax.flow import optical_flow, world_flow
+from zestjax.flow import induced_flow, world_flow
 from zestjax.losses.means import mean_over_valid
 from zestjax.losses.photometric import photometric_loss, reconstruction_loss
 from zestjax.losses.priors import depth_loss, geometric_loss
@@ -257,7 +257,7 @@ def _geometric(prediction, truth, inputs, slots, flows):
     for i, (flow, sign) in enumerate(zip(flows, DIRECTIONS, strict=True)):
         index = jnp.argmax((slots.times == sign).astype(jnp.int32))
         camera = jax.tree.map(lambda x, index=index: x[index], slots.cameras)
-        seen = optical_flow(prediction.dynamic_alone, prediction.marched.points, flow, camera, truth.pixels)
+        seen = induced_flow(prediction.dynamic_alone, prediction.marched.points, flow, camera, truth.pixels)
         there, known = _flow_target(truth, inputs, camera, i)
         valid = seen.visible.astype(flow.dtype) * known * slot_valid(slots, sign)
         total = total + geometric_loss(seen.pixels, there, valid=valid) / 2
