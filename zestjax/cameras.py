@@ -155,6 +155,7 @@ def look_at(position: Array, target: Array, *, up: Array) -> jax.Array:
     position, target, up = jnp.broadcast_arrays(position, target, jnp.asarray(up).astype(position.dtype))
     forward = _unit(target - position)
     sideways = jnp.cross(forward, _unit(up))
+    # A direction that is never `forward`; taken within 1e-4 of parallel, where float32 has three digits left.
     spare = jnp.cross(forward, jnp.roll(jnp.abs(forward) + 1e-3, 1, axis=-1))
     parallel = safe_norm(sideways, keepdims=True) < 1e-4
     right = _unit(jnp.where(parallel, spare, sideways))
@@ -228,6 +229,7 @@ def check_camera(where: str, camera: Camera) -> None:
     rotation = pose[..., :3, :3]
     gram = rotation @ np.swapaxes(rotation, -1, -2)
     lower = np.stack([k[..., 1, 0], k[..., 2, 0], k[..., 2, 1], k[..., 2, 2] - 1], -1)
+    # Rows that are written as 0 and 1 may be off by rounding (1e-6); a rotation read from a text file by three digits.
     faults = {
         "`intrinsics` has an entry that is not finite": ~np.isfinite(k).all((-2, -1)),
         "`camera_from_world` has an entry that is not finite": ~np.isfinite(pose).all((-2, -1)),

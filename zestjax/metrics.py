@@ -94,7 +94,7 @@ def ssim_map(image: Array, truth: Array) -> jax.Array:
     for _ in ("rows", "columns"):
         moments = [jnp.swapaxes(moment, 0, 1) for moment in _window_moments(*moments)]
     mean_a, mean_b, variance_a, variance_b, covariance = moments
-    c1, c2 = 0.01**2, 0.03**2
+    c1, c2 = 0.01**2, 0.03**2  # of Wang et al. 2004, for values in [0, 1]
     luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
     return luminance * (2 * covariance + c2) / (variance_a + variance_b + c2)
 

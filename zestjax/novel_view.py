@@ -221,7 +221,7 @@ def _induced_flow(prediction, place, camera):
     marched = prediction.marched
     moved = place.world(marched.coords + prediction.dynamic.flow_forward)
     flow = jnp.sum(prediction.dynamic_weights[..., None] * (moved - marched.points), axis=1)
-    total = jnp.maximum(jnp.sum(prediction.weights, axis=1, keepdims=True), 1e-6)
+    total = jnp.maximum(jnp.sum(prediction.weights, axis=1, keepdims=True), 1e-6)  # an empty ray has no point
     point = jnp.sum(prediction.weights[..., None] * marched.points, axis=1) / total
     before, after = project(camera, point), project(camera, point + flow / total)
     return jnp.where((before.in_front & after.in_front)[:, None], after.pixels - before.pixels, 0)

@@ -103,5 +103,6 @@ def parallax(cameras: Camera, points: jax.Array, points_beyond: jax.Array) -> ja
     cameras = jax.tree.map(lambda x: x[:, None], cameras)
     here, beyond = project(cameras, points), project(cameras, points_beyond)
     both = here.in_front & beyond.in_front
+    # Behind a view: as far apart as two ends of an image, so that it counts as the farthest of views.
     shift = jnp.where(both[..., None], here.pixels - beyond.pixels, 100.0)
     return jnp.sum(jnp.abs(jax.lax.stop_gradient(shift)), axis=-1)

@@ -97,7 +97,7 @@ def lifted(params: ViewHead, features: jax.Array) -> list[jax.Array]:
 
 def pooled_views(lift: Sequence[jax.Array], weights: jax.Array) -> jax.Array:
     """(P, width) weighted mean over views of their activated features; weights (V, P), every view at least a little."""
-    weights = weights + 1e-3
+    weights = weights + 1e-3  # or a point that no view is trusted at had no features
     total = added(weights[v] for v in range(len(lift)))
     share = jax.lax.optimization_barrier(weights / total[None])
     share = lowered(share, lift[0])
@@ -130,7 +130,7 @@ def blend_of_views(scores: jax.Array, prior: jax.Array, visible: jax.Array, colo
       (P, 3); 0 where no view sees the point.
     """
     scores = SCORE_LIMIT * jnp.tanh(scores / SCORE_LIMIT)
-    weights = jnp.exp(scores) * (prior + 1e-4) * visible
+    weights = jnp.exp(scores) * (prior + 1e-4) * visible  # where no view is trusted, those that see choose the colour
     views = range(weights.shape[0])
     total = added(weights[v] for v in views)
     mean = added(weights[v][None] * colour[v] for v in views)

@@ -60,8 +60,9 @@ class FrameMaps(NamedTuple):
 
 def init_analysis(key: jax.Array, *, planes: int, widths: Sequence[int]) -> AnalysisParams:
     """Parameters for E planes; `widths` are the U-Net's."""
-    n_in = 4 * planes + SUMMARIES + FLOW_CHANNELS + 2 + 12
+    n_in = 4 * planes + SUMMARIES + FLOW_CHANNELS + 2 + 12  # as `_channels` joins them
     net = init_unet2d(key, n_in, widths, 2 * planes + COSTS + 2 + MOVING_PARTS)
+    # A small head: at first the costs decide.
     return AnalysisParams(net._replace(head=jax.tree.map(lambda x: 0.1 * x, net.head)))
 
 

@@ -74,7 +74,7 @@ def _grid(height, width, dtype):
 def _carried(homography, grid):
     """Where a homography takes the grid's pixels (..., 2), and whether they stay in front."""
     points = matvec(homography, grid)
-    front = points[..., 2] > 1e-6
+    front = points[..., 2] > 1e-6  # share of the plane's depth: what is divided by
     return points[..., :2] / jnp.where(front, points[..., 2], 1)[..., None], front
 
 

@@ -146,7 +146,7 @@ def _neighbours(video, camera, time, available, offsets):
     cameras = jax.tree.map(lambda leaf: leaf[index], video.cameras)
     moved = jnp.max(jnp.abs(cameras.camera_from_world - camera.camera_from_world[None]), axis=(1, 2))
     zoomed = jnp.max(jnp.abs(cameras.intrinsics - camera.intrinsics[None]), axis=(1, 2))
-    other_camera = (moved > 1e-6) | (zoomed > 1e-3)
+    other_camera = (moved > 1e-6) | (zoomed > 1e-3)  # more than rounding of a pose, and of focal lengths in pixels
     valid = (times == index) & available[index] & ((jnp.asarray(offsets) != 0) | other_camera)
     return _Frames(video.images[index], cameras), valid
 

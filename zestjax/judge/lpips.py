@@ -64,7 +64,7 @@ def alexnet_activations(params: LpipsParams, image: Array) -> list[jax.Array]:
 
 def lpips_maps(params: LpipsParams, image: Array, truth: Array) -> list[jax.Array]:
     """The distance at every place of every layer: a list of (h, w)."""
-    unit = lambda x: x / (safe_norm(x, axis=-1, keepdims=True) + 1e-10)
+    unit = lambda x: x / (safe_norm(x, axis=-1, keepdims=True) + 1e-10)  # as published
     pairs = zip(*(alexnet_activations(params, picture) for picture in (image, truth)), strict=True)
     return [
         jnp.sum(jnp.square(unit(a) - unit(b)) * head[None, None], axis=-1)

@@ -22,7 +22,7 @@ def all_bodies(scene: Scene) -> Bodies:
 def rotation_from_vector(vector: Array) -> jax.Array:
     """(..., 3, 3) rotations by (..., 3) axis-angle vectors (Rodrigues); exact and differentiable at 0."""
     squared = jnp.sum(vector * vector, axis=-1)
-    small = squared < 1e-12
+    small = squared < 1e-12  # below, the series is exact in float32
     angle = jnp.sqrt(jnp.where(small, 1, squared))
     first = jnp.where(small, 1 - squared / 6, jnp.sin(angle) / angle)[..., None, None]
     second = jnp.where(small, 0.5 - squared / 24, (1 - jnp.cos(angle)) / (angle * angle))[..., None, None]

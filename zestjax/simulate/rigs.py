@@ -94,6 +94,7 @@ def handheld_path(chance: np.random.Generator, count: int, step: float, focus: f
     Returns:
       positions (N, 3), angles (N, 3).
     """
+    # The sizes of drift and shake are guesses.
     heading = chance.uniform(-np.pi, np.pi)
     lateral = np.array([np.cos(heading), 0.25 * np.sin(heading), 0.0])
     forward = np.array([0, 0, chance.normal(0, 0.25)])

@@ -99,6 +99,7 @@ def _graded(chance, tile):
 
 def random_tile(chance: np.random.Generator, split: str) -> np.ndarray:
     """One texture of a split ("training" or "bench"): (TILE, TILE, 3) uint8."""
+    # How often it is a photograph, noise or a pattern, toned or shaded: guesses.
     kind = chance.random()
     if kind < 0.68:
         names = PHOTOGRAPHS[split]
