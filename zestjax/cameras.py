@@ -136,7 +136,7 @@ def relative(a: Camera, b: Camera) -> jax.Array:
     return matmul(a.camera_from_world, rigid_inverse(b.camera_from_world))
 
 
-def look_at(position: Array, target: Array, *, up: Array) -> jax.Array:
+def look_at(position: Array, target: Array, *, up: Array | Sequence[float]) -> jax.Array:
     """Pose of a camera at `position` that sees `target` in its centre, upright.
 
     Args:

@@ -1,1 +1,1 @@
-"""What every module may use: checks of arguments, parts, trees, precisions, safe arithmetic, the compiler."""
+"""What every module may use: types, checks of arguments, parts, trees, precisions, safe arithmetic, the compiler."""
