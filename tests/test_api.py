@@ -68,13 +68,6 @@ def methods(cls):
             yield name, function
 
 
-# Modules that are being rewritten: they get their types with it, and this set is emptied.
-UNTYPED = {
-    "losses.adversarial", "systems.fields", "systems.mvsnerf", "systems.sampling", "systems.system",
-    "train.batches", "train.measures", "train.recipes", "train.schedules", "train.terms", "train.training",
-}  # fmt: skip
-
-
 def test_public_functions_are_typed():
     """Every argument and every result, of the methods of public classes too: pyright checks what has a type."""
     functions = [(name, inspect.unwrap(value)) for name, value in FUNCTIONS]
@@ -84,6 +77,5 @@ def test_public_functions_are_typed():
         found = inspect.signature(function)
         bare = [p.name for p in found.parameters.values() if p.annotation is p.empty and p.name not in ("self", "cls")]
         bare += ["its result"] if found.return_annotation is found.empty else []
-        module = getattr(function, "__module__", "").removeprefix("zestjax.")
-        untyped |= {name: bare} if bare and module not in UNTYPED else {}
+        untyped |= {name: bare} if bare else {}
     assert not untyped

@@ -12,7 +12,7 @@ import stage
 from stage import MINI, PAPER
 
 from zestjax.apps.earlier import Config, recipe_from_config, renamed
-from zestjax.apps.weights import KNOWN, open_weights, recipe_from_metadata
+from zestjax.apps.weights import open_weights, recipe_from_metadata
 from zestjax.base.parts import from_stored, part, to_stored
 from zestjax.fields.heads import HeadParams, Reading
 from zestjax.fields.static import StaticSample
@@ -38,7 +38,7 @@ NAMED = {name: value for name, value in vars(presets).items() if isinstance(valu
 
 @pytest.mark.parametrize("name", NAMED)
 def test_a_system_is_what_its_file_says(name):
-    again = from_stored(through_json(NAMED[name]), KNOWN)
+    again = from_stored(through_json(NAMED[name]), PARTS)
     assert again == NAMED[name] and hash(again) == hash(NAMED[name]) and type(again) is System
 
 
@@ -271,5 +271,5 @@ def test_presets_take_their_parts_from_one_list():
             return set()
         return {type(value)}.union(*(parts_in(getattr(value, f.name)) for f in dataclasses.fields(value)))
 
-    assert set().union(*map(parts_in, RECIPES.values()), *map(parts_in, NAMED.values())) <= {*KNOWN}
-    assert set(PARTS) <= set(KNOWN) and Even in PARTS and Static in PARTS
+    assert set().union(*map(parts_in, RECIPES.values()), *map(parts_in, NAMED.values())) <= {*PARTS}
+    assert Even in PARTS and Static in PARTS

@@ -6,7 +6,6 @@ frames to volumes to fields to pixels: `systems.system.System.encode`, then `Sys
 
 import jax
 
-from zestjax.base.types import Array
 from zestjax.frames.analysis import FrameMaps
 from zestjax.systems.system import Params, Prediction, System
 from zestjax.video import Inputs
@@ -19,7 +18,7 @@ def predict(
     pixels: jax.Array,
     *,
     system: System,
-    jitter: Array | None = None,
+    jitter: jax.Array | None = None,
 ) -> Prediction:
     """Render pixels of a target from its inputs; pure, of one scene and one target, compiled and mapped as you like.
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
 from zestjax.base.numerics import safe_divide
+from zestjax.base.types import Array
 from zestjax.nets.layers import Conv, Norm, conv2d, init_conv2d, init_norm, norm_act
 
 SLOPE = 0.2  # of the leaky rectifiers
@@ -24,7 +25,9 @@ class DiscriminatorParams(NamedTuple):
     norms: tuple[Norm, ...]
 
 
-def init_discriminator(key, *, widths=(32, 64, 128, 256), channels=3):
+def init_discriminator(
+    key: jax.Array, *, widths: tuple[int, ...] = (32, 64, 128, 256), channels: int = 3
+) -> DiscriminatorParams:
     """Parameters of a patch discriminator.
 
     Args:
@@ -41,7 +44,7 @@ def init_discriminator(key, *, widths=(32, 64, 128, 256), channels=3):
     return DiscriminatorParams(convs, tuple(init_norm(width) for width in widths[1:]))
 
 
-def discriminator(params, patches, *, spectral=True):
+def discriminator(params: DiscriminatorParams, patches: jax.Array, *, spectral: bool = True) -> jax.Array:
     """Scores of overlapping parts of each patch.
 
     Reference: ZeST-NeRF networks.py, the discriminator of GRAF (Schwarz et al. 2020).
@@ -69,7 +72,7 @@ def discriminator(params, patches, *, spectral=True):
     return jnp.squeeze(conv2d(bounded(last), x), axis=-1)
 
 
-def spectral_norm(kernel, *, iterations=8):
+def spectral_norm(kernel: jax.Array, *, iterations: int = 8) -> jax.Array:
     """Largest singular value of a kernel as a matrix (..., out), by power iteration from a fixed vector.
 
     Args:
@@ -88,7 +91,7 @@ def spectral_norm(kernel, *, iterations=8):
     return jnp.maximum(left @ (matrix @ right), jnp.finfo(kernel.dtype).eps)
 
 
-def discriminator_loss(real, rendered):
+def discriminator_loss(real: Array, rendered: Array) -> jax.Array:
     """What the discriminator minimises: ((D(real) - 1)^2 + D(rendered)^2) / 2.
 
     Source: LSGAN (Mao et al. 2017), eq. 9.
@@ -103,7 +106,7 @@ def discriminator_loss(real, rendered):
     return (jnp.mean((real - 1) ** 2) + jnp.mean(rendered**2)) / 2
 
 
-def generator_loss(rendered):
+def generator_loss(rendered: Array) -> jax.Array:
     """What the renderer minimises: (D(rendered) - 1)^2.
 
     Source: LSGAN (Mao et al. 2017), eq. 9, without its factor of a half.

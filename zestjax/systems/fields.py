@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from zestjax.base.checks import check_counts, check_option
 from zestjax.base.parts import part
-from zestjax.base.types import Scalar
+from zestjax.base.types import Array, Scalar, T
 from zestjax.encoding import Volume, VolumeParams
 from zestjax.fields import dynamic, static
 from zestjax.fields.conditioning import SourceViews, parallax, sample_views
@@ -58,7 +58,7 @@ class Place(NamedTuple):
     time: Scalar
     duration: Scalar
 
-    def world(self, coords):
+    def world(self, coords: Array) -> jax.Array:
         """World points (..., 3) of coords."""
         return world_from_frustum(self.frustum, coords, spacing=self.spacing)
 
@@ -80,7 +80,7 @@ class Field(Protocol):
         """Parameters, a pytree."""
         ...
 
-    def encode(self, params: Any, inputs: Inputs, maps: FrameMaps | None, frustum: Frustum, depths) -> Seen:
+    def encode(self, params: Any, inputs: Inputs, maps: FrameMaps | None, frustum: Frustum, depths: jax.Array) -> Seen:
         """What it reads of a target; maps: of its own frames."""
         ...
 
@@ -123,7 +123,9 @@ class Static(Choices):
         swept = None if self.volume is None else self.volume.init(volume, views=self.frames.count, motion_votes=False)
         return FieldParams(swept, static.init_static(net, **sizes))
 
-    def encode(self, params, inputs, maps, frustum, depths):
+    def encode(
+        self, params: FieldParams, inputs: Inputs, maps: FrameMaps | None, frustum: Frustum, depths: jax.Array
+    ) -> Seen:
         """See `Field`. Source: ZeST-NeRF eq. 2."""
         return encoded(self, params, inputs, maps, frustum, depths, motion_votes=False)
 
@@ -161,7 +163,9 @@ class Dynamic(Choices):
         channels = 0 if self.volume is None else self.volume.channels
         return FieldParams(swept, dynamic.init_dynamic(net, n_volume=channels, looks=self.head.looks, **sizes))
 
-    def encode(self, params, inputs, maps, frustum, depths):
+    def encode(
+        self, params: FieldParams, inputs: Inputs, maps: FrameMaps | None, frustum: Frustum, depths: jax.Array
+    ) -> Seen:
         """See `Field`. Source: ZeST-NeRF eq. 3."""
         return encoded(self, params, inputs, maps, frustum, depths, motion_votes=True)
 
@@ -221,23 +225,32 @@ def sizes_of(field: Choices, *, axes: int, features: int, summaries: int) -> dic
     )
 
 
-def encoded(field: Choices, params, inputs, maps, frustum, depths, *, motion_votes: bool) -> Seen:
+def encoded(
+    field: Choices,
+    params: FieldParams,
+    inputs: Inputs,
+    maps: FrameMaps | None,
+    frustum: Frustum,
+    depths: jax.Array,
+    *,
+    motion_votes: bool,
+) -> Seen:
     """What a field with a `Swept` volume reads of a target."""
-    if field.volume is None:
+    if field.volume is None or params.volume is None:
         return Seen(None, None)
     frames = field.frames.of(inputs)
     volume = field.volume.encode(params.volume, frames, maps, inputs, frustum, depths, motion_votes=motion_votes)
     return Seen(volume, field.volume.tables.views(frames, maps, inputs))
 
 
-def look_up(volume, coords):
+def look_up(volume: Volume | None, coords: jax.Array) -> jax.Array:
     """(P, channels) of a `Volume`'s cells at frustum coordinates (P, 3); no channels without a volume."""
     if volume is None:
         return jnp.zeros((coords.shape[0], 0), coords.dtype)
     return trilinear(volume.cells, cells_from_frustum(coords, *volume.cells.shape[:3]))
 
 
-def directions_of(field, marched):
+def directions_of(field: Choices, marched: Marched) -> jax.Array:
     """(P, Q) encoded viewing direction of each sample."""
     encoded = positional_encoding(marched.directions, levels=field.view_levels)
     rays, samples = marched.depths.shape
@@ -245,11 +258,11 @@ def directions_of(field, marched):
     return wide.reshape(-1, encoded.shape[1])
 
 
-def flat(x):
+def flat(x: jax.Array) -> jax.Array:
     """(R, S, ...) as (P, ...)."""
     return x.reshape(-1, *x.shape[2:])
 
 
-def gridded(samples, marched):
+def gridded(samples: T, marched: Marched) -> T:
     """A tree of (P, ...) as (R, S, ...)."""
     return jax.tree.map(lambda x: x.reshape(*marched.depths.shape, *x.shape[1:]), samples)

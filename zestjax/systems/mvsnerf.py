@@ -8,18 +8,21 @@ padding    cells that the volume reaches beyond the reference's image on every s
 coords     (..., 3) x, y, z in [0, 1] inside the padded volume; z linear in depth
 """
 
-from typing import ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zestjax.base.checks import check_counts, check_option, check_shapes
 from zestjax.base.parts import part
-from zestjax.base.types import Array, Scalar
+from zestjax.base.types import Array
 from zestjax.cameras import Camera, project, scaled
 from zestjax.cost_volume import mvsnerf_cost_volume, quarter_colours
 from zestjax.fields.static import StaticSample
 from zestjax.fields.trunk import ColourHead, Trunk, direct_colour, init_colour_head, init_trunk, trunk
+from zestjax.frames.analysis import FrameMaps
 from zestjax.frames.selection import KeyFrames
 from zestjax.frustum import Frustum, cells_from_frustum, frustum_from_world
 from zestjax.nets.cost_regulariser import CostRegulariser, cost_regulariser, init_cost_regulariser
@@ -30,6 +33,7 @@ from zestjax.planesweep import homographies, plane_depths
 from zestjax.resample import bilinear, trilinear
 from zestjax.systems.fields import MOST_LAYERS, MOST_WIDTH, Seen, flat, gridded
 from zestjax.systems.system import Space, System
+from zestjax.video import Inputs
 
 LEVELS = 10  # octaves of a point's encoding, as published
 STATISTICS = ("batch", "stored")
@@ -55,10 +59,10 @@ class MvsNerfParams(NamedTuple):
 class Sources(NamedTuple):
     """images: (V, H, W, 3) in [0, 1]. cameras: `Camera` (V, ...). near, far: () of the reference, world units."""
 
-    images: Array
+    images: jax.Array
     cameras: Camera
-    near: Scalar
-    far: Scalar
+    near: Array | np.floating
+    far: Array | np.floating
 
 
 class FieldOutput(NamedTuple):
@@ -68,7 +72,7 @@ class FieldOutput(NamedTuple):
     colour: jax.Array
 
 
-def init_mvsnerf(key, *, views=3, width=128, depth=6):
+def init_mvsnerf(key: jax.Array, *, views: int = 3, width: int = 128, depth: int = 6) -> MvsNerfParams:
     """`MvsNerfParams` of the published shapes."""
     keys = jax.random.split(key, 5)
     features = init_feature_pyramid(keys[0])
@@ -79,12 +83,12 @@ def init_mvsnerf(key, *, views=3, width=128, depth=6):
     return MvsNerfParams(features, regulariser, field)
 
 
-def reference(sources):
+def reference(sources: Sources) -> Camera:
     """The first camera."""
     return jax.tree.map(lambda leaf: leaf[0], sources.cameras)
 
 
-def cost(params, sources, *, planes, padding):
+def cost(params: MvsNerfParams, sources: Sources, *, planes: int, padding: int) -> jax.Array:
     """The published cost volume of the sources: (planes, h + 2 padding, w + 2 padding, 3 V + C).
 
     Raises:
@@ -99,7 +103,7 @@ def cost(params, sources, *, planes, padding):
     return mvsnerf_cost_volume(features, colours, warps, padding=padding)
 
 
-def volume(params, sources, *, planes, padding):
+def volume(params: MvsNerfParams, sources: Sources, *, planes: int, padding: int) -> jax.Array:
     """The encoding volume (planes, h + 2 padding, w + 2 padding, 8).
 
     Reference: MVSNeRF models.py `MVSNet`.
@@ -108,7 +112,7 @@ def volume(params, sources, *, planes, padding):
     return cost_regulariser(params.regulariser, cost(params, sources, planes=planes, padding=padding), legacy_abs=True)
 
 
-def volume_coords(sources, points, *, padding):
+def volume_coords(sources: Sources, points: Array, *, padding: int) -> jax.Array:
     """World points (..., 3) to coords.
 
     Reference: MVSNeRF utils.py `get_ndc_coordinate`.
@@ -121,14 +125,14 @@ def volume_coords(sources, points, *, padding):
     return jnp.stack([x, y, coords[..., 2]], axis=-1)
 
 
-def look_up(volume, coords):
+def look_up(volume: Array, coords: Array) -> jax.Array:
     """(..., C) of a volume at coords; from its outer cells it fades to 0 over one cell."""
     planes, rows, columns = volume.shape[:3]
     cells = cells_from_frustum(coords, planes, rows, columns) + 1
     return trilinear(jnp.pad(volume, [(1, 1), (1, 1), (1, 1), (0, 0)]), cells, border="zero")
 
 
-def view_colours(sources, points):
+def view_colours(sources: Sources, points: Array) -> jax.Array:
     """(P, 4 V): each view's colour where points (P, 3) project to, and 1 where that is inside; else its border repeats.
 
     Reference: MVSNeRF utils.py `build_color_volume`.
@@ -147,7 +151,7 @@ def view_colours(sources, points):
     return jnp.moveaxis(values, 0, 1).reshape(len(points), -1)
 
 
-def field(params, coords, features, direction):
+def field(params: MvsNerfField, coords: jax.Array, features: jax.Array, direction: jax.Array) -> FieldOutput:
     """Density and colour of P points.
 
     Args:
@@ -191,10 +195,12 @@ class MvsNerf:
         known = lambda x: x._replace(statistics=Statistics(0 * x.offset, x.scale)) if isinstance(x, Norm) else x
         return jax.tree.map(known, params, is_leaf=lambda x: isinstance(x, Norm))
 
-    def encode(self, params, inputs, maps, frustum, depths):
+    def encode(
+        self, params: MvsNerfParams, inputs: Inputs, maps: FrameMaps | None, frustum: Frustum, depths: Array
+    ) -> Seen:
         """See `systems.fields.Field`."""
         key = self.frames.of(inputs)
-        sources = Sources(key.images, key.cameras, inputs.near, inputs.far)
+        sources = Sources(jnp.asarray(key.images), key.cameras, inputs.near, inputs.far)
         return Seen(volume(params, sources, planes=len(depths), padding=self.padding), sources)
 
     def __call__(self, params, seen, marched, place):
@@ -224,11 +230,11 @@ class Ends:
     def __post_init__(self):
         check_counts("Ends", samples=(self.samples, 2, MOST_SAMPLES))
 
-    def guide(self, volumes):
+    def guide(self, volumes: Sequence[Any]) -> None:
         """See `systems.sampling.Sampler`."""
         return None
 
-    def fractions(self, guides, pixels, jitter):
+    def fractions(self, guides: Any, pixels: jax.Array, jitter: jax.Array | None) -> jax.Array:
         """See `systems.sampling.Sampler`."""
         even = jnp.linspace(0, 1, self.samples, dtype=pixels.dtype)
         if jitter is None:
@@ -237,7 +243,7 @@ class Ends:
         low, high = jnp.maximum(even - half, 0), jnp.minimum(even + half, 1)
         return low + jitter * (high - low)
 
-    def lengths(self, fractions, depths, inputs, norm, planes):
+    def lengths(self, fractions: Array, depths: Array, inputs: Inputs, norm: Array, planes: int) -> jax.Array:
         """See `systems.sampling.Sampler`."""
         return jnp.ones_like(depths)
 

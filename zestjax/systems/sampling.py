@@ -5,6 +5,7 @@ fraction of a ray, in [0, 1]: 0 at near, 1 at far, even in depth or in inverse d
 guides   (G, h, w) coordinates of likely surfaces of each cell, one map a volume; None where nothing guides
 """
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol
 
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 from zestjax.base.checks import check_counts, check_option
 from zestjax.base.numerics import matvec
 from zestjax.base.parts import part
+from zestjax.base.types import Array
 from zestjax.encoding import Volume
 from zestjax.frames.analysis import plane_moments
 from zestjax.frames.cells import nearest_cells
@@ -41,7 +43,7 @@ class Sampler(Protocol):
         """(R, S) places of the samples; jitter: (R, S) in [0, 1), the places in their strata, or None."""
         ...
 
-    def lengths(self, fractions, depths, inputs: Inputs, norm, planes: int) -> jax.Array:
+    def lengths(self, fractions: Array, depths: Array, inputs: Inputs, norm: Array, planes: int) -> jax.Array:
         """(R, S) what a sample stands for. norm: (R, 1) of the rays' directions. planes: of the volumes."""
         ...
 
@@ -54,16 +56,16 @@ class Guided:
     guided: ClassVar[bool] = True
     fills: ClassVar[bool] = True
 
-    def guide(self, volumes):
+    def guide(self, volumes: Sequence[Any]) -> jax.Array:
         """See `Sampler`."""
         moments = [plane_moments(jnp.moveaxis(volume.logits, 0, -1))[0] for volume in volumes]
         return jax.lax.stop_gradient(jnp.stack(moments))
 
-    def fractions(self, guides, pixels, jitter):
+    def fractions(self, guides: Array, pixels: jax.Array, jitter: jax.Array | None) -> jax.Array:
         """See `Sampler`."""
         return jnp.sort(nearest_cells(guides, pixels), axis=-1)
 
-    def lengths(self, fractions, depths, inputs, norm, planes):
+    def lengths(self, fractions: Array, depths: Array, inputs: Inputs, norm: Array, planes: int) -> jax.Array:
         """See `Sampler`."""
         return jnp.ones_like(depths)
 
@@ -83,16 +85,16 @@ class Even:
         check_counts("Even", samples=(self.samples, 1, MOST_SAMPLES))
         check_option("Even", unit=(self.unit, UNITS))
 
-    def guide(self, volumes):
+    def guide(self, volumes: Sequence[Any]) -> None:
         """See `Sampler`."""
         return None
 
-    def fractions(self, guides, pixels, jitter):
+    def fractions(self, guides: Any, pixels: jax.Array, jitter: jax.Array | None) -> jax.Array:
         """See `Sampler`."""
         place = jnp.full((pixels.shape[0], self.samples), 0.5, pixels.dtype) if jitter is None else jitter
         return (jnp.arange(self.samples, dtype=pixels.dtype)[None] + place) / self.samples
 
-    def lengths(self, fractions, depths, inputs, norm, planes):
+    def lengths(self, fractions: Array, depths: Array, inputs: Inputs, norm: Array, planes: int) -> jax.Array:
         """See `Sampler`."""
         if self.unit == "sample":
             return jnp.ones_like(depths)
@@ -101,7 +103,16 @@ class Even:
         return interval_lengths(depths, inputs.near, inputs.far) * norm
 
 
-def march(sampler: Sampler, space, frustum: Frustum, guides, inputs: Inputs, pixels, *, jitter=None) -> Marched:
+def march(
+    sampler: Sampler,
+    space: Any,
+    frustum: Frustum,
+    guides: Any,
+    inputs: Inputs,
+    pixels: jax.Array,
+    *,
+    jitter: jax.Array | None = None,
+) -> Marched:
     """Samples of each ray of the target.
 
     Args:

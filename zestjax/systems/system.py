@@ -171,7 +171,9 @@ class System:
         found = [seen.volume for seen in (static, dynamic) if seen is not None and seen.volume is not None]
         return Scene(frustum, static, dynamic, self.sampler.guide(found))
 
-    def render(self, params: Params, scene: Scene, inputs: Inputs, pixels: jax.Array, *, jitter=None) -> Prediction:
+    def render(
+        self, params: Params, scene: Scene, inputs: Inputs, pixels: jax.Array, *, jitter: jax.Array | None = None
+    ) -> Prediction:
         """Render pixels of the target.
 
         Args:
@@ -216,18 +218,18 @@ def swept(system: System) -> list[Swept]:
     return [volume for volume in volumes if isinstance(volume, Swept)]
 
 
-def split_maps(maps, count):
+def split_maps(maps: FrameMaps, count: int) -> tuple[FrameMaps, FrameMaps]:
     """`FrameMaps` of V frames into those of the first `count` and the rest."""
     return jax.tree.map(lambda x: x[:count], maps), jax.tree.map(lambda x: x[count:], maps)
 
 
-def last_resort(field):
+def last_resort(field: FieldSamples) -> jax.Array:
     """(R, 3) colour of a ray whose samples are all transparent: the mean of their colours by density, never black."""
     share = field.density + 1e-6  # where no sample has any density, all count alike
     return jnp.sum(share[..., None] * field.colour, axis=-2) / jnp.sum(share, axis=-1)[..., None]
 
 
-def filled(colour, opacity, behind):
+def filled(colour: jax.Array, opacity: jax.Array, behind: jax.Array) -> jax.Array:
     """A ray's colour (R, 3) with what lies behind it (R, 3) where it lets light through; a mean of colours always, also
     where the opacity (R,) of two fields that share their samples is above 1."""
     opacity = opacity[:, None]

@@ -6,6 +6,7 @@ h w      cells, a quarter of the image
 planes   fractional plane index of a true depth, 0 at near
 """
 
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -65,7 +66,7 @@ class PreparedClip(NamedTuple):
     targets: tuple = ()
 
 
-def prepare_clip(key, clip, system: System):
+def prepare_clip(key: jax.Array, clip: Clip, system: System) -> PreparedClip:
     """Evidence of a clip, computed once; the frames in `holes` serve no other frame, as if the video lacked them.
 
     Args:
@@ -84,7 +85,7 @@ def prepare_clip(key, clip, system: System):
     return PreparedClip(clip, evidence, holes)
 
 
-def clip_from_arrays(arrays):
+def clip_from_arrays(arrays: Mapping[str, np.ndarray]) -> Clip:
     """`Clip` of a stored clip's arrays by name.
 
     Raises:
@@ -95,7 +96,7 @@ def clip_from_arrays(arrays):
         raise ValueError(
             f"clip_from_arrays: the stored clip lacks {', '.join(missing)}; delete it, it is rendered again."
         )
-    return Clip(**{name: arrays[name] for name in Clip._fields})
+    return Clip._make(arrays[name] for name in Clip._fields)
 
 
 def _planes(depth, clip, count, *, spacing="inverse"):
@@ -125,7 +126,7 @@ def _target_views(clip, holes):
     return [("view", i, int(t)) for i, t in enumerate(times)] + [("frame", i, i) for i in holes]
 
 
-def batch_from_clip(key, prepared, recipe: Recipe, *, step: int = 0):
+def batch_from_clip(key: jax.Array, prepared: PreparedClip, recipe: Recipe, *, step: int = 0) -> Batch:
     """One target of a clip: which, and which rays of it, is drawn from `key`.
 
     A target at the time of a hole has no slot at its own time; a hole is itself a target that no input has seen.
@@ -180,7 +181,7 @@ def evidence_planes(system: System) -> int:
     return system.space.planes if system.frames is None else system.frames.planes
 
 
-def frame_batch(key, clips, system: System):
+def frame_batch(key: jax.Array, clips: Sequence[PreparedClip], system: System) -> FrameBatch:
     """Frames of several clips: many scenes in one step make its gradient steady.
 
     Args:
@@ -192,11 +193,13 @@ def frame_batch(key, clips, system: System):
       `FrameBatch` of 4 frames of each clip, or of all if it has fewer.
 
     Raises:
-      ValueError: the system asks nothing of single frames.
+      ValueError: the system asks nothing of single frames, or their depths are not known.
     """
     draw = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
     parts = []
     for clip, evidence, *_ in clips:
+        if not isinstance(clip, Clip):
+            raise ValueError("frame_batch: a clip is of `KnownFrames`, whose depths nobody knows; give simulated ones.")
         if evidence is None:
             raise ValueError("frame_batch: the system asks nothing of single frames (`frames` is None); use `OwnMaps`.")
         chosen = draw.permutation(len(clip.images))[:FRAMES_PER_CLIP]

@@ -23,7 +23,7 @@ from zestjax.losses.scene_flow import cycle_loss, minimum_flow_loss, spatial_smo
 from zestjax.losses.supervision import motion_mask_loss
 from zestjax.rendering import composite, confidence_map, weights_from_density
 from zestjax.systems.system import Params, Prediction, Scene, System
-from zestjax.video import Inputs
+from zestjax.video import Frames, Inputs
 
 DIRECTIONS = (1, -1)
 Known = jax.Array | np.ndarray | None
@@ -68,13 +68,14 @@ class Warped(NamedTuple):
     back: jax.Array
 
 
-def slot_valid(slots, offset):
+def slot_valid(slots: Frames, offset: int) -> jax.Array:
     """() 1 if the slot at this offset from the target time is among the slots and filled, else 0."""
     return jnp.max(jnp.where(slots.times == offset, slots.valid, 0))
 
 
-def slots_about(inputs):
+def slots_about(inputs: Inputs) -> Frames:
     """The slots of `Inputs` with times relative to the target's."""
+    assert inputs.slots is not None
     return inputs.slots._replace(times=inputs.slots.times - inputs.time)
 
 

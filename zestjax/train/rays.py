@@ -35,7 +35,7 @@ class Rows:
     def __post_init__(self):
         check_counts("Rows", count=(self.count, 1, MOST_RAYS))
 
-    def draw(self, rng, moving, step):
+    def draw(self, rng: np.random.Generator, moving: np.ndarray, step: int) -> np.ndarray:
         """See `Rays`."""
         height, width = moving.shape
         if self.count > height:
@@ -58,7 +58,7 @@ class Pixels:
     def __post_init__(self):
         check_counts("Pixels", count=(self.count, 1, MOST_RAYS), mined=(self.mined, 0, MOST_RAYS))
 
-    def draw(self, rng, moving, step):
+    def draw(self, rng: np.random.Generator, moving: np.ndarray, step: int) -> np.ndarray:
         """See `Rays`."""
         if self.count > moving.size:
             raise ValueError(f"Pixels: `count` is {self.count}, the target has {moving.size} pixels; take fewer.")
@@ -92,7 +92,7 @@ class Patch:
         if self.decay < 0:
             raise ValueError(f"Patch: `decay` is {self.decay}, expected at least 0.")
 
-    def draw(self, rng, moving, step):
+    def draw(self, rng: np.random.Generator, moving: np.ndarray, step: int) -> np.ndarray:
         """See `Rays`."""
         height, width = moving.shape
         reach = min(height, width) - 1

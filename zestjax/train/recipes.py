@@ -3,7 +3,7 @@
 step     number of updates already made, from 0
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -150,7 +150,7 @@ class Recipe:
         adversary = self.adversary if ADV in present(weights) else None
         return replace(self, weights=replace(self.weights, terms=pairs(weights)), adversary=adversary)
 
-    def of(self, system: System, *, known=None) -> "Recipe":
+    def of(self, system: System, *, known: Collection[str] | None = None) -> "Recipe":
         """The recipe of another system: of its weights, those whose terms it can measure; known: see `terms`."""
         weights = measurable(system, dict(self.weights.terms), own=self.terms, known=known)
         return replace(self, system=system).weighted(weights)

@@ -3,15 +3,20 @@
 step   () int from 0: the number of updates already made. A Python int, or an array inside a compiled step.
 """
 
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from zestjax.base.checks import check_option
+from zestjax.base.types import Scalar
 
 PRIORS = ("geo", "depth")
 
 
-def cosine(step, *, peak, floor, steps, warmup=0):
+def cosine(step: Scalar, *, peak: float, floor: float, steps: int, warmup: int = 0) -> jax.Array:
     """Learning rate that rises linearly to `peak`, then falls along half a cosine to `floor`.
 
     Source: ZeST-NeRF section 4 (Adam, 5e-4); the cosine to 1e-7 is the released configuration's.
@@ -37,7 +42,15 @@ def cosine(step, *, peak, floor, steps, warmup=0):
     return jnp.where(step < warmup, peak * (step + 1) / max(warmup, 1), falling)
 
 
-def decayed_priors(weights, step, *, decay, shape="staircase", end=None, terms=PRIORS):
+def decayed_priors(
+    weights: Mapping[str, Any],
+    step: Scalar,
+    *,
+    decay: float,
+    shape: str = "staircase",
+    end: int | None = None,
+    terms: Collection[str] = PRIORS,
+) -> dict[str, Any]:
     """Loss weights at a step: those of the priors fade, since the networks that made them are not exact.
 
     Source: ZeST-NeRF section 3.5 ("decay their contribution to zero during training").

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from zestjax.encoding import Volume
+from zestjax.frames.analysis import FrameMaps
 from zestjax.frames.cells import pooled
 from zestjax.losses.means import mean_over_valid
 from zestjax.losses.objective import present
@@ -160,7 +162,9 @@ def weights_of(terms: Mapping[str, Any], weights: Mapping[str, Any]) -> dict[str
     return {name: weight for name, weight in present(weights).items() if name in terms}
 
 
-def scene_terms(maps, volumes, batch, weights: Mapping[str, Any]) -> dict[str, jax.Array]:
+def scene_terms(
+    maps: FrameMaps | None, volumes: tuple[Volume | None, Volume | None], batch: Any, weights: Mapping[str, Any]
+) -> dict[str, jax.Array]:
     """What is known of a scene before any ray: depths of the volumes and of the frames, moving pixels; the terms whose
     weights are not absent."""
     found = {name: VOLUMES[name](volumes, batch) for name in weights_of(VOLUMES, weights)}

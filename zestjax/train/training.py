@@ -8,10 +8,13 @@ one does, bit for bit on one machine with one number of threads. Nothing here re
 `zestjax.apps.train` does.
 """
 
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+
+from zestjax.base.types import Tree
 
 
 class TrainState(NamedTuple):
@@ -22,7 +25,7 @@ class TrainState(NamedTuple):
     step: int
 
 
-def clip_window(step, *, window, steps_per_clip, count=None):
+def clip_window(step: int, *, window: int, steps_per_clip: int, count: int | None = None) -> range:
     """Indices of the clips that step `step` may see: the newest few; one joins every `steps_per_clip` steps.
 
     Args:
@@ -39,7 +42,9 @@ def clip_window(step, *, window, steps_per_clip, count=None):
     return range(oldest, newest + 1) if count is None else range(max(oldest, newest - count + 1), newest + 1)
 
 
-def clip_index(step, *, seed, window, steps_per_clip, count=None, draw=0):
+def clip_index(
+    step: int, *, seed: int, window: int, steps_per_clip: int, count: int | None = None, draw: int = 0
+) -> int:
     """A clip that step `step` of run `seed` sees: drawn evenly from `clip_window` by (seed, step, draw) alone."""
     live = clip_window(step, window=window, steps_per_clip=steps_per_clip, count=count)
     number = int(np.random.SeedSequence([seed, step, draw]).generate_state(1, np.uint64)[0])
@@ -47,19 +52,21 @@ def clip_index(step, *, seed, window, steps_per_clip, count=None, draw=0):
     return index if count is None else index % count
 
 
-def batch_key(step, *, seed):
+def batch_key(step: int, *, seed: int) -> jax.Array:
     """The random key of step `step`'s batch: which target, which rays, which slots are dropped."""
     return jax.random.fold_in(jax.random.key(seed), step)
 
 
-def scalars(info):
+def scalars(info: Tree) -> dict[str, float]:
     """A step's report, any tree of () arrays, as {leaf path: float}; other leaves are left out."""
     leaves = jax.tree_util.tree_leaves_with_path(info)
     named = ((jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in leaves)
     return {name or "total": float(leaf) for name, leaf in named if np.ndim(leaf) == 0}
 
 
-def training_steps(step_fn, state, batch_at, *, steps):
+def training_steps(
+    step_fn: Callable, state: TrainState, batch_at: Callable[[int], Any], *, steps: int
+) -> Iterator[tuple[TrainState, dict[str, float]]]:
     """Runs steps `state.step` to `steps` - 1 and yields (state, info) after each.
 
     The next batch is prepared while the device computes the current step. `step_fn` may donate its arguments:
