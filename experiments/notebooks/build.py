@@ -26,7 +26,9 @@ def rendered(path):
     notebook = jupytext.read(path)
     notebook.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
     start = time.perf_counter()
-    NotebookClient(notebook, timeout=LIMIT, resources={"metadata": {"path": str(path.parent)}}).execute()
+    folder = {"metadata": {"path": str(path.parent)}}
+    # The limit is for an idle machine: a cell is stopped only where it hangs.
+    NotebookClient(notebook, timeout=4 * LIMIT, coalesce_streams=True, resources=folder).execute()
     seconds = time.perf_counter() - start
     for cell in notebook.cells:
         cell["outputs"] = [o for o in cell.get("outputs", []) if for_reading(o)]
@@ -54,6 +56,8 @@ def main():
         if not path.stem.startswith(names):
             continue
         text, figures, seconds = rendered(path)
+        for old in (HERE / "rendered").glob(f"{path.stem}_output_*"):
+            old.unlink()
         for name, content in {f"{path.stem}.md": text.encode(), **figures}.items():
             write_bytes(HERE / "rendered" / name, content)
         late += [path.stem] if seconds > LIMIT else []
