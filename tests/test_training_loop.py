@@ -404,7 +404,7 @@ def test_a_clip_of_another_origin_is_rendered_again(source, tmp_path, capfd, cha
     spec = clips.ClipSpec(0, 4, 6)._replace(**{k: v for k, v in change.items() if k in ("seed", "frames")})
     with monkeypatch.context() as patch:
         if "code" in change:
-            patch.setattr(clips, "_code", lambda *_: change["code"])
+            patch.setattr(clips, "code_digest", lambda *_: change["code"])
         origin = clips.origin_of(spec, change.get("index", 5))
     clips.write_clip(clips.clip_path(tmp_path, 5), {"images": np.zeros(3)}, origin)
     assert (source.clip(5, [5])["images"] == 5).all()
@@ -414,7 +414,7 @@ def test_a_clip_of_another_origin_is_rendered_again(source, tmp_path, capfd, cha
 
 def test_a_missing_module_is_not_taken_for_an_empty_one():
     with pytest.raises(ValueError, match="has no moved.py"):
-        clips._code("simulate/*.py", "moved.py")
+        clips.code_digest("simulate/*.py", "moved.py")
 
 
 def test_a_producer_that_fails_says_why(source, capfd):

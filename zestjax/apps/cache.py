@@ -16,6 +16,8 @@ import tempfile
 import time
 from pathlib import Path
 
+import jax
+
 from zestjax.io.files import check_writable, make_folder
 
 STALE_DAYS = 30  # whoever resumes a run does it within weeks; later, its clips are rendered again, seconds each
@@ -33,6 +35,13 @@ def cache_folder():
     except (RuntimeError, OSError):  # Runtime: no home is known
         return _private_folder()
     return folder if folder.is_absolute() else _private_folder()
+
+
+def keep_compiled():
+    """Keep compiled programs in the cache folder, unless the user has named another."""
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
 
 
 @functools.cache

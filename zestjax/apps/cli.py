@@ -1,6 +1,7 @@
 """The `zestjax` command: parses, calls `zestjax.apps`, and turns errors into one line and an exit code.
 
-Exit codes: 0 done; 2 bad arguments or bad input, one line on standard error that starts with `error:`; 1 anything else.
+Exit codes: 0 done; 2 bad arguments or bad input, one line on standard error that starts with `error:`; 75 (`crossval`)
+not all has ended, run it again; 1 anything else.
 Progress goes to standard error, one summary line to standard output; with --quiet, neither.
 """
 
@@ -49,7 +50,7 @@ def _run(options, given):
         line = f"{line}; go on with: {shlex.join(['zestjax', *again])}"
     if not quiet:
         print(line, flush=True)
-    return 0 if finished else 1
+    return 0 if finished is True else finished or 1
 
 
 def _check_out(options):
@@ -102,13 +103,9 @@ def _of_the_machine(error):
 
 def _prepare_jax():
     """Compiled programs are kept in the user's cache folder, so that a command compiles once."""
-    import jax
+    from zestjax.apps.cache import keep_compiled
 
-    from zestjax.apps.cache import cache_folder
-
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    keep_compiled()
 
 
 if __name__ == "__main__":

@@ -46,19 +46,19 @@ def clip_folder(spec, *, root=None):
     name = f"{spec.height}x{spec.width}-{spec.frames}+{spec.targets}-seed{spec.seed}"
     if root is not None:
         return Path(root) / name
-    return cache_folder() / "clips" / f"{name}-{_code('simulate/*.py')}"
+    return cache_folder() / "clips" / f"{name}-{code_digest('simulate/*.py')}"
 
 
 def evidence_folder(folder, planes):
     """Where the evidence of a folder's clips lies: by planes and by the code that finds it."""
     parts = ("frames/evidence", "frames/cells", "frames/optical_flow", "frames/assembly", "frames/selection",
              "planesweep", "resample", "cameras")  # fmt: skip
-    code = _code(*(f"{name}.py" for name in parts))
+    code = code_digest(*(f"{name}.py" for name in parts))
     return Path(folder) / f"evidence-{planes}-{code}"
 
 
 @functools.cache
-def _code(*patterns):
+def code_digest(*patterns):
     """Eight digits that change with the source files of the package that match; read once, as the code itself is."""
     package = Path(__file__).parents[1]
     found = [sorted(package.glob(pattern)) for pattern in patterns]
@@ -77,7 +77,7 @@ def clip_path(folder, index):
 def origin_of(spec, index):
     """What clip `index` of a spec is a function of, and so its evidence in the folder that names how it is found."""
     size = f"{spec.height}x{spec.width}, {spec.frames}+{spec.targets} frames"
-    return f"clip {index} of seed {spec.seed}, {size}, simulator {_code('simulate/*.py')}"
+    return f"clip {index} of seed {spec.seed}, {size}, simulator {code_digest('simulate/*.py')}"
 
 
 def read_clip(path, origin):

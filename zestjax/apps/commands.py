@@ -1,12 +1,13 @@
 """The commands of `zestjax`: their flags, and the functions of `zestjax.apps` that they call, imported when called.
 
-run    function of a command's flags, a dict: (the summary line, whether all is done)
+run    function of a command's flags, a dict: (the summary line, whether all is done, or else an exit code)
 """
 
 import argparse
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 
 class _Parser(argparse.ArgumentParser):
@@ -27,6 +28,7 @@ def parser():
         _render,
         _evaluate,
         _frontier,
+        _crossval,
         _import_mvsnerf,
         _import_lpips,
         _doctor,
@@ -35,11 +37,11 @@ def parser():
     return whole
 
 
-def _command(commands, name, about, run, *, out=None):
+def _command(commands, name, about, run, *, out=None, seed: Any = 0):
     """A command with the flags that all have."""
     command = commands.add_parser(name, help=about, description=about)
     command.add_argument("--out", type=Path, required=out is None, default=out, metavar="DIR", help="folder to write")
-    command.add_argument("--seed", type=_natural, default=0, help="of everything random (default 0)")
+    command.add_argument("--seed", type=natural, default=seed, help="of everything random (default 0)")
     command.add_argument("--quiet", action="store_true", help="print nothing but errors")
     command.set_defaults(run=run)
     return command
@@ -55,9 +57,9 @@ def _simulate(commands):
     command = _command(commands, "simulate", "a simulated scene with exact answers, in the NSFF layout", _run_simulate)
     which = command.add_mutually_exclusive_group(required=True)
     which.add_argument("--scene", metavar="NAME", help="of zest-bench, with or without `bench:`")
-    which.add_argument("--random", type=_natural, metavar="KEY", help="a random scene, a function of this number")
-    command.add_argument("--size", type=_size, default=(144, 256), metavar="HxW")
-    command.add_argument("--frames", type=_positive, default=24)
+    which.add_argument("--random", type=natural, metavar="KEY", help="a random scene, a function of this number")
+    command.add_argument("--size", type=size, default=(144, 256), metavar="HxW")
+    command.add_argument("--frames", type=positive, default=24)
 
 
 def _train(commands):
@@ -70,29 +72,31 @@ def _train(commands):
     command.add_argument(
         "--scenes", nargs="+", default=(), metavar="PATH", help="learn from these (default: simulated)"
     )
-    command.add_argument("--steps", type=_positive, default=20_000, help="in all, and length of the schedule")
+    command.add_argument("--steps", type=positive, default=20_000, help="in all, and length of the schedule")
     command.add_argument("--precision", default="float32", help="of the networks: float32 or bfloat16")
-    command.add_argument("--peak", type=_positive_float, help="highest learning rate (default: the preset's)")
-    command.add_argument("--minutes", type=_positive_float, metavar="M", help="stop after so much stepping in all")
+    command.add_argument("--set", dest="settings", nargs="+", default=(), type=setting, metavar="NAME=VALUE",
+                         help="parts of the recipe: rate.peak=1e-3, rays.count=8, weights.TERM=0")  # fmt: skip
+    command.add_argument("--peak", type=positive_float, help="highest learning rate (default: the preset's)")
+    command.add_argument("--minutes", type=positive_float, metavar="M", help="stop after so much stepping in all")
     command.add_argument("--resume", action="store_true", help="go on from the folder's newest checkpoint")
     command.add_argument("--weights", type=Path, metavar="W", help="start from these")
     command.add_argument(
         "--analysis", type=Path, metavar="W", help="take what analyses single frames from these instead"
     )
     command.add_argument("--clips", type=Path, metavar="DIR", help="keep the rendered clips here")
-    command.add_argument("--clip-count", type=_positive, metavar="N", help="reuse N clips (default: new ones for ever)")
-    command.add_argument("--window", type=_positive, default=16, help="clips alive at a time (default 16)")
-    command.add_argument("--steps-per-clip", type=_positive, default=4, help="steps until a new clip joins (default 4)")
-    command.add_argument("--checkpoint-minutes", type=_positive_float, default=5.0)
+    command.add_argument("--clip-count", type=positive, metavar="N", help="reuse N clips (default: new ones for ever)")
+    command.add_argument("--window", type=positive, default=16, help="clips alive at a time (default 16)")
+    command.add_argument("--steps-per-clip", type=positive, default=4, help="steps until a new clip joins (default 4)")
+    command.add_argument("--checkpoint-minutes", type=positive_float, default=5.0)
 
 
 def _finetune(commands):
     command = _command(commands, "finetune", "adapts weights to one scene", _run_finetune)
     _scene_flags(command)
     command.add_argument(
-        "--budget", type=_positive_float, default=60.0, metavar="SECONDS", help="of stepping (default 60)"
+        "--budget", type=positive_float, default=60.0, metavar="SECONDS", help="of stepping (default 60)"
     )
-    command.add_argument("--exclude", type=_numbers, default=(), metavar="i,j,...", help="frames that are never read")
+    command.add_argument("--exclude", type=numbers, default=(), metavar="i,j,...", help="frames that are never read")
     command.add_argument("--resume", action="store_true", help="go on from the folder's newest checkpoint")
 
 
@@ -100,18 +104,18 @@ def _render(commands):
     command = _command(commands, "render", "a camera path through a scene", _run_render)
     _scene_flags(command)
     command.add_argument("--path", default="orbit", help="orbit, spiral, wander, freeze, frames, or a file")
-    command.add_argument("--frames", type=_positive, help="of the path (default: twice the video's)")
-    command.add_argument("--budget-seconds", type=_positive_float, metavar="S", help="for all frames: renders smaller")
+    command.add_argument("--frames", type=positive, help="of the path (default: twice the video's)")
+    command.add_argument("--budget-seconds", type=positive_float, metavar="S", help="for all frames: renders smaller")
     command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
     command.add_argument("--precision", help="float32, bfloat16 (networks only) or float64 (default: the weights' own)")
-    command.add_argument("--fps", type=_positive_float, default=12.0)
+    command.add_argument("--fps", type=positive_float, default=12.0)
 
 
 def _evaluate(commands):
     command = _command(commands, "evaluate", "scores against held-out truth, beside floors and ceiling", _run_evaluate)
     _scene_flags(command)
     command.add_argument("--protocol", default="held-out", help="held-out, strict or paper (default held-out)")
-    command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: all)")
+    command.add_argument("--targets", type=numbers, metavar="i,j,...", help="times to predict (default: all)")
     command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
     command.add_argument("--precision", help="float32, bfloat16 (networks only) or float64 (default: the weights' own)")
     command.add_argument("--lpips", type=Path, metavar="FILE", help="LPIPS's weights, from import-lpips (default: n/a)")
@@ -121,7 +125,14 @@ def _evaluate(commands):
 def _frontier(commands):
     command = _command(commands, "frontier", "accuracy against time: what each setting buys", _run_frontier)
     _scene_flags(command)
-    command.add_argument("--targets", type=_numbers, metavar="i,j,...", help="times to predict (default: four)")
+    command.add_argument("--targets", type=numbers, metavar="i,j,...", help="times to predict (default: four)")
+
+
+def _crossval(commands):
+    from zestjax.apps.crossval_flags import add_flags
+
+    about = "each scene held out in turn: trained on the others and scored on it, over systems, seeds and settings"
+    add_flags(_command(commands, "crossval", about, _run_crossval, seed=argparse.SUPPRESS))
 
 
 def _import_command(commands, name, about, run):
@@ -157,7 +168,7 @@ def _doctor(commands):
     about = "versions, devices, flags, known miscompilations tried, memory, cache, extras"
     command = commands.add_parser("doctor", help=about, description=about)
     command.add_argument("--json", action="store_true", help="the same as JSON")
-    command.add_argument("--seed", type=_natural, default=0, help="of the numbers the compiler is tried with")
+    command.add_argument("--seed", type=natural, default=0, help="of the numbers the compiler is tried with")
     command.add_argument("--quiet", action="store_true", help="print nothing: the exit code tells")
     command.set_defaults(run=_run_doctor)
 
@@ -167,7 +178,7 @@ def _scene_flags(command):
     command.add_argument("--format", metavar="NAME", help="layout of the folder (default: recognised)")
     command.add_argument("--weights", type=Path, metavar="W", help="default: the shipped ones")
     command.add_argument("--system", help="refuse weights of another system")
-    command.add_argument("--size", type=_size, metavar="HxW", help="default: the preset's height")
+    command.add_argument("--size", type=size, metavar="HxW", help="default: the preset's height")
 
 
 def _run_demo(options):
@@ -214,6 +225,12 @@ def _run_frontier(options):
     return frontier(FrontierOptions(**options)), True
 
 
+def _run_crossval(options):
+    from zestjax.apps.crossval import command
+
+    return command(options)
+
+
 def _run_import_mvsnerf(options):
     from zestjax.apps.weights import import_mvsnerf
 
@@ -232,31 +249,39 @@ def _run_doctor(options):
     return doctor(DoctorOptions(**options))
 
 
-def _size(text):
+def setting(text):
+    """A part of a recipe and its value, as a command line gives them."""
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise argparse.ArgumentTypeError(f"{text!r} is no setting: give NAME=VALUE, as rate.peak=1e-3")
+    return name, value
+
+
+def size(text):
     if not (match := re.fullmatch(r"(\d+)x(\d+)", text)) or min(int(side) for side in match.groups()) < 16:
         raise argparse.ArgumentTypeError(f"{text!r} is no size: give HxW, each at least 16")
     return int(match[1]), int(match[2])
 
 
-def _numbers(text):
+def numbers(text):
     if not re.fullmatch(r"\d+(,\d+)*", text):
         raise argparse.ArgumentTypeError(f"{text!r} is no list of frame numbers: give i,j,...")
     return tuple(int(number) for number in text.split(","))
 
 
-def _natural(text):
+def natural(text):
     if not text.isdigit():
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0")
     return int(text)
 
 
-def _positive(text):
+def positive(text):
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1")
     return int(text)
 
 
-def _positive_float(text):
+def positive_float(text):
     try:
         value = float(text)
     except ValueError:

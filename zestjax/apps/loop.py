@@ -173,7 +173,7 @@ class _Clock:
 
 
 class _StopOnSignal:
-    """Turns the first Ctrl-C or SIGTERM into a wish that the loop grants after its step; the second ends it at once."""
+    """Turns Ctrl-C and SIGTERM into a wish that the loop grants after its step; a second Ctrl-C ends it at once."""
 
     def __enter__(self):
         self.asked, self.before = False, {}
@@ -183,7 +183,7 @@ class _StopOnSignal:
         return self
 
     def _ask(self, number, frame):
-        if self.asked:
+        if self.asked and number == signal.SIGINT:
             raise KeyboardInterrupt
         self.asked = True
 

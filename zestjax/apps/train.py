@@ -28,6 +28,7 @@ from zestjax.frames.known import answers_of, shared
 from zestjax.train.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
 from zestjax.train.learn import STAGES, find_fault, stage_weights
 from zestjax.train.recipes import RECIPES, SYSTEMS, recipe_of
+from zestjax.train.settings import with_settings
 from zestjax.train.terms import measurable, unmeasured
 from zestjax.train.training import TrainState, batch_key, clip_index, clip_window
 
@@ -47,7 +48,7 @@ class TrainOptions:
     clips; None: new ones for ever. window: clips alive at a time. steps_per_clip: steps between one new clip and the
     next. scenes: folders (or `bench:NAME`) whose own frames are predicted from one another; no simulated clips.
     checkpoint_minutes: between two checkpoints. system: one of `recipes.SYSTEMS`. stage: one of `learn.STAGES`.
-    peak: highest learning rate, by default the recipe's.
+    peak: highest learning rate, by default the recipe's. settings: (name, value) of `settings.with_setting` each.
     """
 
     out: Path
@@ -69,6 +70,7 @@ class TrainOptions:
     stage: str = "all"
     peak: float | None = None
     precision: str = "float32"
+    settings: tuple = ()
 
 
 class Summary(NamedTuple):
@@ -95,6 +97,7 @@ def train(options):
         raise ValueError("train: --stage frames learns from exact answers, which --scenes lack; drop one of them.")
     check_option("train", preset=(options.preset, tuple(RECIPES)))
     whole = recipe_of(options.preset, system=options.system, precision=options.precision)
+    whole = with_settings(whole, options.settings)
     scenes = [open_scene(name, whole, protocol=None).scene for name in options.scenes]
     frames = shared([known_of(scene) for scene in scenes])
     recipe = run_recipe(whole, options, known=answers_of(frames[0]) if frames else None)

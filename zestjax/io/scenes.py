@@ -171,16 +171,31 @@ def _found(path, layout):
     if layout is not None:
         check_option("load_scene", layout=(layout, tuple(LAYOUTS)))
     known = {layout: LAYOUTS[layout]} if layout is not None else LAYOUTS
-    folders = [path]
-    for _ in range(3):
-        found = [(p, name) for p in folders for name, (recognises, _) in known.items() if recognises(p)]
-        if len({p for p, _ in found}) > 1:
-            names = ", ".join(sorted({str(p.relative_to(path)) for p, _ in found})[:5])
-            raise ValueError(f"{path}: holds several scenes ({names}); name one of them.")
-        if found:
-            return found[0]
-        folders = [inside for p in folders for inside in visible(p) if inside.is_dir() and os.access(inside, os.X_OK)]
+    found = scenes_in(path, known=known)
+    if len(folders := {folder for folder, _ in found}) > 1:
+        names = ", ".join(sorted({str(p.relative_to(path)) for p in folders})[:5])
+        raise ValueError(f"{path}: holds several scenes ({names}); name one of them.")
+    if found:
+        return found[0]
     raise ValueError(f"{path}: {_unsupported(path, tuple(known))}")
+
+
+def scenes_in(path, *, known=LAYOUTS):
+    """The scenes that a folder is or holds, at the first of three levels that has any.
+
+    Args:
+      path: a folder.
+      known: layouts by name, as `LAYOUTS`.
+
+    Returns:
+      list of (folder, name of a layout that it is in).
+    """
+    folders = [Path(path)]
+    for _ in range(3):
+        if found := [(p, name) for p in folders for name, (recognises, _) in known.items() if recognises(p)]:
+            return found
+        folders = [inside for p in folders for inside in visible(p) if inside.is_dir() and os.access(inside, os.X_OK)]
+    return []
 
 
 def _unsupported(path, known):
