@@ -114,7 +114,9 @@ def _render(commands):
 def _evaluate(commands):
     command = _command(commands, "evaluate", "scores against held-out truth, beside floors and ceiling", _run_evaluate)
     _scene_flags(command)
-    command.add_argument("--protocol", default="held-out", help="held-out, strict or paper (default held-out)")
+    command.add_argument(
+        "--protocol", default="held-out", help="held-out, strict, paper or fixed-view (default held-out)"
+    )
     command.add_argument("--targets", type=numbers, metavar="i,j,...", help="times to predict (default: all)")
     command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
     command.add_argument("--precision", help="float32, bfloat16 (networks only) or float64 (default: the weights' own)")

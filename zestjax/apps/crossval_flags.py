@@ -40,7 +40,7 @@ CHOICES = {
                  "several values make a grid"),
     "weights": ("--weights", Path, None, "W", "start from these"),
     "finetune": ("--finetune", amount, None, "N|Ns", "then adapt to the scene held out: steps, or seconds"),
-    "protocol": ("--protocol", str, None, "NAME", "held-out, strict or paper (default held-out)"),
+    "protocol": ("--protocol", str, None, "NAME", "held-out, strict, paper or fixed-view (default held-out)"),
     "size": ("--size", size, None, "HxW", "of what is scored (default: the preset's height)"),
     "targets": ("--targets", numbers, None, "i,j,...", "times to predict (default: all)"),
     "lpips": ("--lpips", Path, None, "FILE", "LPIPS's weights, from import-lpips (default: n/a)"),

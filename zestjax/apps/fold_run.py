@@ -145,7 +145,7 @@ def _score(place, plan, fold, weights, quiet):
 
 def _finish(place, plan, fold, weights, heart):
     """Say what the result is of, and put it in its place by one renaming."""
-    model = open_weights(weights, published=True)
+    model = open_weights(weights)
     metrics = read_record(place.fold / "metrics.json")
     if weights is not None and weights.is_relative_to(place.fold):
         metrics["weights"] = str(place.result / weights.relative_to(place.fold))

@@ -14,7 +14,7 @@ from zestjax.base.checks import check_option
 from zestjax.cameras import project, unproject
 from zestjax.io.files import resolved
 from zestjax.io.layouts import select
-from zestjax.io.scenes import PROTOCOLS, Scene, Target, load_scene
+from zestjax.io.scenes import FIXED_VIEW_FRAMES, PROTOCOLS, Scene, Target, load_scene
 from zestjax.simulate.bench import BENCH
 
 BENCH_SIZE = (144, 256)
@@ -35,7 +35,7 @@ def open_scene(name, recipe, *, size=None, protocol: str | None = "held-out", ta
       name: folder, or `bench:NAME`.
       recipe: `Recipe`, whose height is the default of a folder's pictures; zest-bench is 144 x 256 by default.
       size: (height, width), or None.
-      protocol: `held-out`, `strict` or `paper`; None where no target is wanted.
+      protocol: one of `io.scenes.PROTOCOLS`; None where no target is wanted.
       targets: times to predict, or None for all. Of zest-bench all means every time, by one held-out camera each.
       layout: of the folder, recognised unless told.
       exclude: frames that are never read; they are black.
@@ -103,10 +103,15 @@ def _open_bench(name, size, protocol, targets, exclude):
     video.images[list(exclude)] = 0
     if protocol is None:
         return Opened(Scene(name, video, (), layout="bench"), None)
-    times = range(simulated.frames) if targets is None else targets
-    if outside := [time for time in times if not 0 <= time < simulated.frames]:
-        raise ValueError(f"bench:{name}: no target {outside[0]}; its times are 0 to {simulated.frames - 1}.")
-    cameras = [held_out_camera(simulated, t) if protocol == "held-out" else int(simulated.taken[t]) for t in times]
+    first, there = int(simulated.taken[0]), range(simulated.frames)
+    if protocol == "fixed-view":
+        video = jax.tree.map(lambda x: x[:FIXED_VIEW_FRAMES] if x.ndim else x, video)
+        there = [time for time in there[:FIXED_VIEW_FRAMES] if int(simulated.taken[time]) != first]
+    times = there if targets is None else targets
+    if outside := [time for time in times if time not in there]:
+        raise ValueError(f"bench:{name}: no target {outside[0]}; its times are {there[0]} to {there[-1]}.")
+    camera_at = {"held-out": lambda t: held_out_camera(simulated, t), "fixed-view": lambda t: first}
+    cameras = [camera_at.get(protocol, lambda t: int(simulated.taken[t]))(t) for t in times]
     shown = answers(simulated, list(times), cameras)
     listed = [target_from_answers(shown, i, cameras[i], protocol) for i in range(len(times))]
     limit = lambda target: ceiling(simulated, video, target.camera, target.time)
@@ -124,7 +129,7 @@ def target_from_answers(shown, i, camera, protocol):
     time, view = int(shown.times[i]), select(shown.cameras, i)
     return Target(
         time=time,
-        camera_name="input" if protocol != "held-out" else f"cam{camera + 1:02d}",  # numbered as published
+        camera_name="input" if protocol in ("strict", "paper") else f"cam{camera + 1:02d}",  # numbered as published
         camera=view,
         image=shown.images[i],
         dynamic=shown.moving[i],

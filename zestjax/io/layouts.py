@@ -7,7 +7,7 @@ lists them and does the rest, the same way for all.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
@@ -75,6 +75,18 @@ class Record:
     truth: Mapping[int, Path] = field(default_factory=dict)
     held_out: Sequence[HeldOut] = ()
     reserved: tuple[int, ...] = ()
+
+    def first(self, count: int) -> "Record":
+        """The record of the first frames alone."""
+        early = lambda files: {time: path for time, path in files.items() if time < count}
+        maps = ("motion_masks", "disparity", "flow_forward", "flow_backward", "truth")
+        held = self.held_out
+        return replace(
+            self, images=self.images[:count], cameras=select(self.cameras, slice(count)),
+            held_out=Later(lambda: [entry for entry in held if entry.time < count]),
+            reserved=tuple(time for time in self.reserved if time < count),
+            **{name: early(getattr(self, name)) for name in maps},
+        )  # fmt: skip
 
 
 def bounds_from_frames(bounds: np.ndarray, *, where: FilePath = "bounds_from_frames") -> tuple[float, float]:

@@ -11,11 +11,14 @@ A protocol says what the targets are:
     strict     frames of the video itself, each never among its own inputs
     paper      frames of the video itself, which are among the inputs: this leaks the answer, and is kept only to set
                figures beside the paper's
+    fixed-view the first twelve frames are the inputs; the camera of the first is held, and predicted at the times that
+               other cameras took (Gao et al. 2021, DynNeRF, and those who compare with it)
 """
 
+import dataclasses
 import os
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,7 +38,8 @@ from zestjax.io.pictures import SUFFIXES, image_size, read_image, read_mask, res
 from zestjax.io.reading import open_regular, visible
 from zestjax.video import Video
 
-PROTOCOLS = ("held-out", "strict", "paper")
+PROTOCOLS = ("held-out", "strict", "paper", "fixed-view")
+FIXED_VIEW_FRAMES = 12  # as DynNeRF counts them, one of each camera of the rig
 
 LAYOUTS = dict(
     idr=(is_idr, read_idr), llff=(is_llff, read_llff), nsff=(is_nsff, read_nsff), nrnerf=(is_nrnerf, read_nrnerf)
@@ -117,7 +121,7 @@ def load_scene(
       height: rows wanted; None follows from the width by the pictures' shape, or is theirs.
       width: columns wanted; the same.
       layout: its name; recognised unless told.
-      protocol: `held-out`, `strict` or `paper`; see above.
+      protocol: one of `PROTOCOLS`; see above.
       targets: which times to predict, as frame indices; `(time, camera name)` pairs choose single pictures; None for
         all.
       exclude: frames whose pictures are not read; they are black. (With `held-out`, where poses must be told from
@@ -135,6 +139,9 @@ def load_scene(
     check_option("load_scene", protocol=(protocol, PROTOCOLS))
     path, layout = _found(path, layout)
     record = LAYOUTS[layout][1](path)
+    record = record.first(FIXED_VIEW_FRAMES) if protocol == "fixed-view" else record
+    if protocol == "fixed-view" and not record.held_out:
+        raise ValueError(f"{path}: has no pictures of other cameras (mv_images), so none of a fixed one; use `strict`.")
     if protocol == "held-out" and not (record.held_out or record.reserved):
         raise ValueError(f"{path}: has no pictures of other cameras (mv_images), so no held-out target; use `strict`.")
     if outside := [i for i in exclude if not 0 <= i < len(record.images)]:
@@ -180,7 +187,7 @@ def _found(path, layout):
     raise ValueError(f"{path}: {_unsupported(path, tuple(known))}")
 
 
-def scenes_in(path, *, known=LAYOUTS):
+def scenes_in(path: FilePath, *, known: Mapping[str, tuple] = LAYOUTS) -> list[tuple[Path, str]]:
     """The scenes that a folder is or holds, at the first of three levels that has any.
 
     Args:
@@ -236,12 +243,21 @@ def _resized(cameras, have, size):
 
 def _listed(record, video, masks, protocol):
     """[((time, camera name), reader)] of a protocol's targets."""
+    if protocol == "fixed-view":
+        held = [entry for entry in record.held_out if same_place(entry.camera, select(record.cameras, 0))]
+        return _other_views(dataclasses.replace(record, held_out=held), video.images.shape[1:3])
     if protocol != "held-out":
         excluded = lambda time: (time,) if protocol == "strict" else ()
         return _own_views(record, video, masks, range(len(video.images)), excluded)
     if record.held_out:
         return _other_views(record, video.images.shape[1:3])
     return _own_views(record, video, masks, record.reserved, lambda time: record.reserved)
+
+
+def same_place(a: Camera, b: Camera) -> bool:
+    """Whether two cameras are one, but for rounding."""
+    pose, other = np.asarray(a.camera_from_world), np.asarray(b.camera_from_world)
+    return np.allclose(pose, other, atol=1e-4 * max(1.0, float(np.abs(other).max())))  # float32 files, read and turned
 
 
 def _own_views(record, video, masks, times, excluded):
