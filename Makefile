@@ -12,7 +12,7 @@ FAST = ZESTJAX_FAST_COMPILING=1
 TEST_ENV = PJRT_NPROC=1 OMP_NUM_THREADS=1 MPLBACKEND=Agg
 PYTEST = $(TEST_ENV) $(RUN) -m pytest -q -n $(WORKERS) --dist loadfile
 
-.PHONY: test lint demo bench fuzz kills mutations stability precision notebooks test-slow test-lowest test-newest clean
+.PHONY: test lint demo bench fuzz kills slurm mutations stability precision notebooks test-slow test-lowest test-newest clean
 
 $(VENV)/installed: pyproject.toml
 	@test -n "$(PYTHON)" || { echo "error: no Python 3.11-3.13 with venv found; pass PYTHON=/path/to/python" >&2; exit 2; }
@@ -57,6 +57,11 @@ precision: $(VENV)/installed
 # Kill trainings 100 times, inside their writes and at random, and compare what they resume to with an unbroken run.
 kills: $(VENV)/installed
 	$(RUN) experiments/kills.py --out runs/kills
+
+# A cross-validation on a real SLURM of one node, installed from Debian's packages: as root, in a container.
+slurm: $(VENV)/installed
+	$(RUN) -m pip install -q -e '.[slurm]'
+	$(TEST_ENV) $(RUN) experiments/slurm.py --out runs/slurm
 
 # Run the notebooks and write experiments/notebooks/rendered/.
 notebooks: $(VENV)/installed

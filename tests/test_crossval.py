@@ -1,19 +1,22 @@
 """Cross-validation: what runs, what is not run twice, what a kill, a full disk or another launcher leaves."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import crossval_stub
 import numpy as np
 import pytest
 from scipy import stats
 
-from zestjax.apps import crossval_table, evaluate, fold_state, train
+from zestjax.apps import crossval_table, evaluate, fold_state, launchers, train
 from zestjax.apps.cli import main
 from zestjax.apps.crossval import crossval
 from zestjax.apps.fold_state import Place, State, locked, seconds_left, state_of, worked_on
@@ -116,6 +119,13 @@ def test_folds_of_scenes_with_one_name_have_two(tmp_path):
     assert [fold.name for fold in plan.folds] == ["a-dense", "b-dense"]
 
 
+def test_a_link_to_a_scene_is_that_scene(tmp_path, capsys):
+    a_scene(tmp_path / "scene")
+    (tmp_path / "link").symlink_to(tmp_path / "scene")
+    given = [str(tmp_path / name) for name in ("scene", "link")]
+    refused(capsys, run(tmp_path / "out", "--scenes", *given), f"{tmp_path}/scene is given twice")
+
+
 @pytest.mark.parametrize(
     "flags, words",
     [
@@ -133,8 +143,8 @@ def test_folds_of_scenes_with_one_name_have_two(tmp_path):
         (["--set", "blocks=1", "blocks=2"], ["blocks", "given twice"]),
         (["--finetune", "40", "--protocol", "strict"], ["--finetune", "strict"]),
         (["--weights", "nowhere.safetensors"], ["nowhere.safetensors"]),
-        (["--resume"], ["nothing to resume"]),
-        (["status"], ["nothing to resume"]),
+        (["--resume"], ["nothing was begun"]),
+        (["status"], ["nothing was begun"]),
     ],
 )
 def test_bad_choices_are_one_line_and_nothing_is_begun(tmp_path, capsys, flags, words):
@@ -212,7 +222,7 @@ def test_a_scene_that_vanishes_fails_by_its_name_and_nothing_is_lost(tmp_path, c
     scenes = [str(tmp_path / name) for name in ("a", "b")]
     assert run(tmp_path / "out", "plan", "--scenes", *scenes, "--preset", "tiny", "--quiet") == 0
     (tmp_path / "b").rename(tmp_path / "c")
-    assert run(tmp_path / "out", "run", "--fold", "0", "--quiet") == 1
+    assert run(tmp_path / "out", "run", "--fold", "1", "--quiet") == 1
     assert f"{tmp_path / 'b'}: is not a folder" in capsys.readouterr().err
     refused(capsys, run(tmp_path / "out", "--scenes", *scenes), "b: is not a folder")
     assert read_plan(tmp_path / "out").scenes == tuple(scenes)
@@ -306,6 +316,83 @@ def test_another_hosts_fold_is_alive_while_its_counter_moves(tmp_path, monkeypat
     assert worked_on(place, True)
     place.beat.write_text(json.dumps(beat | {"ended": True}))
     assert not worked_on(place, True) and worked_on(place, False)
+
+
+class Scheduler:
+    """What `launchers.slurm` uses of submitit and of SLURM: jobs run when the queue is next asked. `waits`: asks until
+    then."""
+
+    def __init__(self, waits=0):
+        self.jobs, self.waits, self.wanted, self.submitted = {}, waits, {}, 0
+
+    def AutoExecutor(self, folder, *, cluster, slurm_max_num_timeout):
+        assert cluster == "slurm" and slurm_max_num_timeout > 100
+        return self
+
+    def update_parameters(self, **wanted):
+        if unknown := wanted.keys() - {"name", "slurm_time", "slurm_array_parallelism", "slurm_partition"}:
+            raise ValueError(f"Unavailable parameter(s): {sorted(unknown)}\nValid parameters are:\n  - time")
+        self.wanted = wanted
+
+    def batch(self):
+        return contextlib.nullcontext()
+
+    def submit(self, fold):
+        self.submitted += 1
+        self.jobs[name := f"7_{self.submitted}"] = fold
+        return SimpleNamespace(job_id=name)
+
+    def queue(self, unknown=()):
+        known, self.waits = set(self.jobs), self.waits - 1
+        if self.waits < 0:
+            for name in list(self.jobs):
+                main(self.jobs.pop(name).command[3:])
+        return known
+
+
+def test_slurm_gets_an_array_of_what_is_left_and_finds_its_jobs_again(tmp_path, monkeypatch, capsys):
+    scheduler = Scheduler()
+    monkeypatch.setattr(launchers, "_submitit", lambda: scheduler)
+    monkeypatch.setattr(launchers, "_queue", scheduler.queue)
+    monkeypatch.setattr(launchers, "QUEUE_SECONDS", 0.0)
+    monkeypatch.setenv("STUB_FAILS", "bench:blobs")
+    given = ("--launcher", "slurm", "--jobs", "2", "--slurm", "partition=gpu", "time=60")
+    assert run(tmp_path, *GIVEN, *given) == 1
+    assert scheduler.wanted == {
+        "name": "zestjax",
+        "slurm_time": 60,
+        "slurm_array_parallelism": 2,
+        "slurm_partition": "gpu",
+    }
+    assert scheduler.submitted == 3 and run(tmp_path, *given, "--quiet") == 1 and scheduler.submitted == 3
+    scheduler.jobs["8_0"] = launchers.SlurmFold(["", "", "", "crossval", "table", "--out", str(tmp_path), "--quiet"])
+    scheduler.waits = 1
+    (tmp_path / "slurm/jobs.json").write_text('{"1": "8_0"}')
+    assert run(tmp_path, *given, "--failed", "--quiet") == 1 and scheduler.submitted == 3  # it is in the queue already
+    capsys.readouterr()
+    refused(capsys, run(tmp_path, *given, "--failed", "--slurm", "colour=red", "--quiet"), "--slurm", "slurm_colour")
+
+
+def test_slurm_that_is_not_there_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(launchers, "_submitit", lambda: None)
+    refused(capsys, run(tmp_path, *GIVEN, "--launcher", "slurm"), "no `squeue`")
+    monkeypatch.undo()
+    monkeypatch.setattr(launchers, "import_module", lambda _: (_ for _ in ()).throw(ModuleNotFoundError()))
+    monkeypatch.setattr("zestjax.apps.cli._prepare_jax", lambda: None)
+    refused(capsys, run(tmp_path, *GIVEN, "--launcher", "slurm"), "zestjax[slurm]")
+
+
+def test_a_job_that_slurm_takes_asks_its_fold_to_save(monkeypatch):
+    saves = "import signal, sys, time; signal.signal(signal.SIGUSR2, lambda *_: sys.exit(75)); time.sleep(60)"
+    job, again = launchers.SlurmFold([sys.executable, "-c", saves]), []
+    monkeypatch.setattr(launchers, "import_module", lambda _: SimpleNamespace(DelayedSubmission=again.append))
+    thread = threading.Thread(target=lambda: pytest.raises(RuntimeError, job))
+    thread.start()
+    time.sleep(1.0)
+    job.checkpoint()
+    thread.join(10)
+    assert job.child.returncode == 75 and again[0].command == job.command
 
 
 def test_the_time_left_is_of_what_has_not_ended():

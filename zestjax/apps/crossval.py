@@ -20,7 +20,7 @@ from zestjax.apps.launchers import LAUNCHERS, RUN_AGAIN
 from zestjax.apps.tables import counted
 from zestjax.base.checks import check_option
 
-COSTS = {"tiny": (0.02, 30.0, 1.5), "small": (0.9, 240.0, 3.0), "paper": (54.0, 600.0, 11.1)}
+COSTS = {"tiny": (0.05, 100.0, 2.4), "small": (0.9, 240.0, 3.0), "paper": (54.0, 600.0, 11.1)}
 """By preset: seconds of a step, seconds beside (compiling, scoring), GB; of `zest` on two cores. Finished folds tell
 better."""
 
@@ -76,7 +76,7 @@ def _run(out, plan, options):
     fold = plan.folds[options["fold"]]
     outcome = run_fold(out, plan, fold, failed=options["failed"], quiet=options["quiet"])
     state = state_of(out, plan, fold)
-    why = {"failed": f": {state.reason}; once that is mended, run it with --failed",
+    why = {"failed": f": {str(state.reason).rstrip('.')}; once that is mended, run it with --failed",
            "stopped": ": run it again, and it goes on", "running": " in another process"}.get(outcome, "")  # fmt: skip
     line = f"crossval: fold {fold.index} {fold.label} {outcome}{why}"
     if outcome == "failed":
@@ -95,7 +95,7 @@ def _summary(out, plan, table):
     if count["done"] == len(states):
         return line, True
     if count["done"] + count["failed"] == len(states):
-        return f"{line}; `--failed` runs those that failed again, `crossval status` says why", False
+        return f"{line}; `--failed` runs those that failed again, `crossval status` says why", 1
     return f"{line}; run it again to go on", RUN_AGAIN
 
 

@@ -23,9 +23,11 @@ from zestjax.apps.clips import code_digest
 from zestjax.apps.fold_state import Heart, Place, finished, locked, read_record, worked_on
 from zestjax.apps.folds import read_plan
 from zestjax.apps.memory import peak_megabytes, reset_peak
+from zestjax.apps.scenes import open_scene
 from zestjax.apps.weights import open_weights
 from zestjax.base.parts import to_stored
 from zestjax.io.files import remove_parts, write_bytes
+from zestjax.train.recipes import recipe_of
 
 OUT_OF_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)  # of the place: no fold's fault, and every other's end too
 LOOKERS = 1.0  # seconds to wait for a lock that only a `status` may hold for a moment
@@ -67,23 +69,25 @@ def run_fold(out, plan, fold, *, failed=False, quiet=False):
             return "failed"
         place.failed.unlink(missing_ok=True)
         remove_parts(place.work)
-        with Heart(place.beat) as heart:
-            return _worked(place, plan, fold, heart, quiet)
+        with stopped_by_signals():
+            try:
+                with Heart(place.beat) as heart:
+                    return _worked(place, plan, fold, heart, quiet)
+            except KeyboardInterrupt:
+                return "stopped"
 
 
 def _worked(place, plan, fold, heart, quiet):
     """`run_fold` of a fold that is held and not finished."""
     try:
-        with stopped_by_signals():
-            code_digest("**/*.py")  # kept, as it is while the fold runs
-            reset_peak()
-            weights = _weights(place, plan, fold, heart, quiet)
-            heart.stage = "evaluate"
-            _score(place, plan, fold, weights, quiet)
-            _finish(place, plan, fold, weights, heart)
+        code_digest("**/*.py")  # kept, as it is while the fold runs
+        reset_peak()
+        _check_scored(plan, fold)
+        weights = _weights(place, plan, fold, heart, quiet)
+        heart.stage = "evaluate"
+        _score(place, plan, fold, weights, quiet)
+        _finish(place, plan, fold, weights, heart)
         return "done"
-    except KeyboardInterrupt:
-        return "stopped"
     except Exception as error:
         if isinstance(error, OSError) and error.errno in OUT_OF_ROOM:
             raise
@@ -94,6 +98,13 @@ def _worked(place, plan, fold, heart, quiet):
         }  # fmt: skip
         write_bytes(place.failed, (json.dumps(told, indent=1) + "\n").encode())
         return "failed"
+
+
+def _check_scored(plan, fold):
+    """Refuse a scene that cannot be scored before anything is trained for it; those of zest-bench always can."""
+    if not fold.scene.startswith("bench:"):
+        recipe = recipe_of(plan.preset, system=fold.system)
+        open_scene(fold.scene, recipe, size=plan.size, protocol=plan.protocol, targets=plan.targets)
 
 
 def _weights(place, plan, fold, heart, quiet):
@@ -130,7 +141,7 @@ def _weights(place, plan, fold, heart, quiet):
 def _ended(summary):
     """The weights of a run that a signal did not end."""
     if not summary.result.finished:
-        raise Stop
+        _stop()
     return summary.weights
 
 
@@ -169,11 +180,11 @@ def libraries():
 
 @contextlib.contextmanager
 def stopped_by_signals():
-    """Context: SIGTERM, and SIGUSR2 as schedulers send it, end what is done by `Stop`; a training saves its state
-    first, by a handler of its own."""
+    """Context: the first SIGTERM, or SIGUSR2 as schedulers send it, ends what is done by `Stop`; a training saves its
+    state first, by a handler of its own."""
     before = {}
     with contextlib.suppress(ValueError):  # not the main thread: no signals to catch
-        before[signal.SIGTERM] = signal.signal(signal.SIGTERM, _raise_stop)
+        before[signal.SIGTERM] = signal.signal(signal.SIGTERM, _stop)
         before[signal.SIGUSR2] = signal.signal(signal.SIGUSR2, lambda *_: signal.raise_signal(signal.SIGTERM))
     try:
         yield
@@ -182,7 +193,9 @@ def stopped_by_signals():
             signal.signal(number, handler)
 
 
-def _raise_stop(number, frame):
+def _stop(*_):
+    with contextlib.suppress(ValueError):  # not the main thread
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # schedulers send it twice
     raise Stop
 
 

@@ -116,7 +116,7 @@ def agreed_plan(out, given, *, resume=False):
     Args:
       out: folder.
       given: dict, some of `Plan`'s fields.
-      resume: refuse a folder that has no plan.
+      resume: refuse a folder that has none.
 
     Raises:
       ValueError: choices that cannot be, or others than the stored plan's, by name, once a fold has begun.
@@ -125,7 +125,7 @@ def agreed_plan(out, given, *, resume=False):
     stored = read_plan(out)
     if stored is None:
         if resume:
-            raise ValueError(f"{out}: has no {PLAN}, so nothing to resume; drop --resume, or give the --out of a run.")
+            raise ValueError(f"{out}: has no {PLAN}, so nothing was begun there; give the --out of a cross-validation.")
         return _store(out, check_plan(dataclasses.replace(Plan(), **_started(given, Plan()))))
     plan = dataclasses.replace(stored, **_started(given, stored))
     if plan.stored == stored.stored:

@@ -82,29 +82,26 @@ def slurm(out, plan, folds, *, jobs=None, failed=False, quiet=False, options=(),
       ValueError: there is no submitit or no SLURM, or an option that it does not have.
     """
     submitit, record = _submitit(), Path(out) / "slurm" / "jobs.json"
-    queued, ids = _queue(), read_record(record)
-    still = {index for index, job in ids.items() if job in queued}
-    folds = [fold for fold in folds if str(fold.index) not in still]
-    if folds:
+    queued = _queue()
+    jobs_of = {index: job for index, job in read_record(record).items() if job in queued}
+    if new := [fold for fold in folds if str(fold.index) not in jobs_of]:
         executor = submitit.AutoExecutor(resolved(out) / "slurm", cluster="slurm", slurm_max_num_timeout=SLURM_TIMEOUTS)
-        wanted = {"time": SLURM_MINUTES, "array_parallelism": jobs or len(folds)} | dict(options)
+        wanted = {"time": SLURM_MINUTES, "array_parallelism": jobs or len(new)} | dict(options)
         try:
             executor.update_parameters(name="zestjax", **{f"slurm_{name}": value for name, value in wanted.items()})
         except (ValueError, NameError) as error:
             raise ValueError(f"crossval: --slurm: {' '.join(str(error).split())}") from error
         with executor.batch():
-            started = [executor.submit(SlurmFold(command_of(out, fold, failed))) for fold in folds]
-        ids |= {str(fold.index): job.job_id for fold, job in zip(folds, started, strict=True)}
-        write_bytes(record, json.dumps(ids).encode())
-    told, open_jobs = set(), set(ids.values())
+            started = [executor.submit(SlurmFold(command_of(out, fold, failed))) for fold in new]
+        jobs_of |= {str(fold.index): job.job_id for fold, job in zip(new, started, strict=True)}
+        write_bytes(record, json.dumps(jobs_of).encode())
     with contextlib.suppress(KeyboardInterrupt), stopped_by_signals():
-        while open_jobs:
+        while jobs_of:
             time.sleep(QUEUE_SECONDS)
-            open_jobs &= _queue(open_jobs)
-            for fold in plan.folds:
-                if fold.index not in told and str(fold.index) in ids and ids[str(fold.index)] not in open_jobs:
-                    told.add(fold.index)
-                    _say(out, plan, fold, quiet)
+            queued = _queue(jobs_of.values())
+            for index in [index for index, job in jobs_of.items() if job not in queued]:
+                del jobs_of[index]
+                _say(out, plan, plan.folds[int(index)], quiet)
 
 
 class SlurmFold:
