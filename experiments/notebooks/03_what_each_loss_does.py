@@ -130,4 +130,4 @@ figure.tight_layout(pad=0.3)
 #   On one clip the colours alone tell the model most of it; what these terms are for shows on scenes that it has not
 #   seen.
 #
-# A clip of 32 x 48 pixels and 400 steps are a sketch; the ablation of the whole system is `experiments/ablation.py`.
+# A clip of 32 x 48 pixels and 400 steps are a sketch; the ablation of the whole system is in `experiments/study.py`.

@@ -150,7 +150,7 @@ def trained(system, steps=60):
     objective = training_objective(system, weights=dict(rec=1.0, smooth=0.002), own={"smooth": smooth}, blocks=2)
     solver = Adam(fun=objective, has_aux=True, learning_rate=5e-3, clip_norm=1.0)
     params = system.init(jax.random.key(1))
-    state, step, losses = solver.init_state(params), jax.jit(solver.update), []
+    state, step, losses = solver.init_state(params, batches[0]), jax.jit(solver.update), []
     params, state = step(params, state, batches[0])
     start = time.perf_counter()
     for i in range(steps):

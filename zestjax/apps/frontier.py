@@ -21,6 +21,7 @@ from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, score_image
 from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.cameras import resized
+from zestjax.io.figures import png_of
 from zestjax.io.files import write_bytes
 from zestjax.io.pictures import resize_area
 from zestjax.systems.sampling import Even
@@ -160,6 +161,4 @@ def draw(path, rows, title):
         axes.annotate(row["setting"], place, xytext=(4, -9), textcoords="offset points", fontsize=7)
     axes.set(xlabel="seconds per frame", ylabel="PSNR, full image (dB)", title=title, xscale="log")
     axes.legend()
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120)
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, png_of(figure))

@@ -3,7 +3,6 @@
 A line holds step, seconds (of stepping so far), seconds_per_step, and the mean of every scalar the steps reported.
 """
 
-import io
 import json
 import math
 import time
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from zestjax.io.figures import png_of
 from zestjax.io.files import append_bytes, write_bytes
 from zestjax.io.reading import parse_json, read_regular
 
@@ -116,9 +116,7 @@ def draw_curve(log, path):
         axes.plot(steps, smooth, color="C0", linewidth=1.4)
         axes.set_title(name, fontsize=9)
         axes.tick_params(labelsize=7)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    write_bytes(path, buffer.getvalue())
+    write_bytes(path, png_of(figure))
 
 
 def _numbers(line):

@@ -3,8 +3,10 @@
 picture  (H, W, 3) RGB, float in [0, 1] or uint8
 """
 
+import io
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import matplotlib
@@ -13,6 +15,13 @@ import numpy as np
 from zestjax.base.checks import check_shapes
 from zestjax.base.types import Array
 from zestjax.io.pictures import to_bytes
+
+
+def png_of(figure: Any, *, dpi: int = 110) -> bytes:
+    """A matplotlib `Figure` as the bytes of a PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()
 
 
 def depth_picture(depth: Array, *, near: float, far: float) -> np.ndarray:
