@@ -15,14 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
+from zestjax.apps.clips import ClipSpec, clip_folder, make_clip
 from zestjax.apps.commands import size
 from zestjax.apps.crossval import crossval
 from zestjax.apps.crossval_table import interval
 from zestjax.apps.log import read_log
+from zestjax.apps.progress import progress
 from zestjax.apps.train import TrainOptions, train
 from zestjax.io.files import write_bytes
 from zestjax.simulate.bench import BENCH
-from zestjax.train.recipes import SYSTEMS
+from zestjax.train.recipes import SYSTEMS, recipe_of
 
 PAPER = {
     "zest": ((21.59, 0.6239, 0.2048), (26.94, 0.8575, 0.0995)),
@@ -48,6 +50,18 @@ def pace(system, options):
         known[system] = float(np.median([row["seconds_per_step"] for row in rows]))
         write_bytes(path, (json.dumps(known, indent=1) + "\n").encode())
     return known[system]
+
+
+def render_clips(options):
+    """Render the shared clips before anything is timed: two cores serve one thing at a time."""
+    planes = {
+        getattr(recipe_of(options.preset, system=system).system.frames, "planes", 0) for system in options.systems
+    }
+    for count in planes:
+        spec = ClipSpec(options.seed, *options.size, planes=count)
+        folder = clip_folder(spec, root=options.out / "clips")
+        for index in progress(range(options.clips), "clips", quiet=options.quiet):
+            make_clip(spec, folder, index)
 
 
 def learned(system, out, steps, options):
@@ -187,6 +201,8 @@ def draw(path, found):
 def study(options):
     """Run it, or go on; {system: see `measured`}."""
     results = {}
+    if options.learn == "simulated":
+        render_clips(options)
     for system in options.systems:
         results[system] = measured(system, options)
         write_bytes(options.out / "study.md", markdown(results, options).encode())
