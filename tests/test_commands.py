@@ -176,3 +176,32 @@ def test_nsff_learns_a_scene_by_heart_through_the_same_commands(place, scene):
     report = json.loads((place / "nsff_scores/metrics.json").read_text())
     assert report["system"] == "nsff" and report["mean"]["full"]["psnr"] > 5
     finish(place, "render", "--scene", scene, "--weights", weights, "--frames", 2, "--out", place / "nsff_path")
+
+
+def test_a_fold_that_is_killed_ends_with_the_bits_of_one_that_is_not(place):
+    for name in ("blobs", "walker"):
+        finish(place, "simulate", "--scene", name, "--size", "32x48", "--frames", 6, "--out", place / "few" / name)
+    given = ("crossval", "--scenes", place / "few", "--preset", "tiny", "--steps", 40, "--targets", 2)
+    given += ("--checkpoint-minutes", 0.0001)
+    assert finish(place, *given, "--out", place / "unbroken").startswith("crossval: 2 of 2 folds done: zest ")
+    process = start(place, *given, "--out", place / "broken")
+    while process.poll() is None and not list(place.glob("broken/work/000/fold/train/checkpoints/step_*")):
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not list(place.glob("broken/folds/*/*"))
+    finish(place, *given, "--out", place / "broken")
+    for file in ("blobs/train/weights.safetensors", "walker/train/weights.safetensors"):
+        (whole, _), (resumed, _) = (load_weights(place / out / "folds/zest" / file) for out in ("unbroken", "broken"))
+        assert all(np.array_equal(whole[name], resumed[name]) for name in whole)
+    assert "2 of 2 folds finished" in (place / "broken/table.md").read_text()
+    tuned = ("--system", "zest-none", "--steps", 4, "--finetune", 3, "--preset", "tiny", "--targets", 2)
+    told = finish(place, "crossval", *tuned, "--scenes", place / "few", "--out", place / "tuned")
+    assert told.startswith("crossval: 2 of 2 folds done")
+    learned = place / "tuned/folds/zest-none/blobs/finetune/weights.safetensors"
+    flags = ("--system", "zest-none", "--steps", 0, "--weights", learned, "--targets", 2)
+    finish(place, "crossval", *flags, "--scenes", place / "few/blobs", "--out", place / "scored")
+    one, other = (
+        json.loads((place / f"{name}/folds/zest-none/blobs/metrics.json").read_text()) for name in ("tuned", "scored")
+    )
+    assert one["mean"]["full"] == other["mean"]["full"] and one["weights"] == other["weights"] == str(learned)

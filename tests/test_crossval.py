@@ -20,7 +20,7 @@ from zestjax.apps import crossval_table, evaluate, fold_state, launchers, train
 from zestjax.apps.cli import main
 from zestjax.apps.crossval import crossval
 from zestjax.apps.fold_state import Place, State, locked, seconds_left, state_of, worked_on
-from zestjax.apps.folds import DYNAMIC_SCENES, agreed_plan, read_plan
+from zestjax.apps.folds import DYNAMIC_SCENES, _short_names, agreed_plan, read_plan
 from zestjax.io.pictures import write_image
 
 SCENES = ("bench:walker", "bench:blobs", "bench:marbles")
@@ -117,6 +117,11 @@ def test_folds_of_scenes_with_one_name_have_two(tmp_path):
         a_scene(tmp_path / name)
     plan = agreed_plan(tmp_path / "out", {"scenes": [tmp_path / "a/dense", tmp_path / "b/dense"]})
     assert [fold.name for fold in plan.folds] == ["a-dense", "b-dense"]
+    assert _short_names(("bench:walker", "/data/walker", "/b/data/walker")) == [
+        "walker",
+        "data-walker",
+        "b-data-walker",
+    ]
 
 
 def test_a_link_to_a_scene_is_that_scene(tmp_path, capsys):
@@ -396,10 +401,22 @@ def test_a_job_that_slurm_takes_asks_its_fold_to_save(monkeypatch):
 
 
 def test_the_time_left_is_of_what_has_not_ended():
-    states = [State("done", seconds=100.0), State("failed"), State("running", "train", 50, 100, 45.0), State("waiting")]
-    assert seconds_left(states, None) == pytest.approx(55 + 100)
+    states = [
+        State("done", seconds=100.0),
+        State("failed"),
+        State("running", "train", 50, 100, 90.0, 1.0),
+        State("waiting"),
+    ]
+    assert seconds_left(states, None) == pytest.approx(50 + 14 + 100)  # what compiling took is no pace
+    assert seconds_left([State("running", "train", 1, 100, 90.0, 0.0)], 200.0) == 110.0
     assert seconds_left([State("waiting")] * 3, 10.0) == 30.0 and seconds_left([State("waiting")], None) is None
     assert seconds_left([State("running", "evaluate", 5, 5, 90.0)] * 2 + [State("waiting")] * 2, 100.0) == 110.0
+
+
+def test_choices_may_be_given_as_python_has_them(tmp_path):
+    plan = agreed_plan(tmp_path, {"systems": "zest-none", "settings": {"rate.peak": (1e-3, 5e-4), "blocks": 1}})
+    assert plan.settings == (("rate.peak", ("0.001", "0.0005")), ("blocks", ("1",)))
+    assert {fold.row for fold in plan.folds} == {"zest-none,rate.peak=0.001", "zest-none,rate.peak=0.0005"}
 
 
 def test_intervals_are_students():

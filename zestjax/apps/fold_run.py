@@ -24,7 +24,7 @@ from zestjax.apps.fold_state import Heart, Place, finished, locked, read_record,
 from zestjax.apps.folds import read_plan
 from zestjax.apps.memory import peak_megabytes, reset_peak
 from zestjax.apps.scenes import open_scene
-from zestjax.apps.weights import open_weights
+from zestjax.apps.weights import open_weights, shipped_weights
 from zestjax.base.parts import to_stored
 from zestjax.io.files import remove_parts, write_bytes
 from zestjax.train.recipes import recipe_of
@@ -68,7 +68,8 @@ def run_fold(out, plan, fold, *, failed=False, quiet=False):
         if read_record(place.failed).get("reason") and not failed:
             return "failed"
         place.failed.unlink(missing_ok=True)
-        remove_parts(place.work)
+        for folder in (place.work, place.fold, place.fold / "pictures"):
+            remove_parts(folder)
         with stopped_by_signals():
             try:
                 with Heart(place.beat) as heart:
@@ -114,8 +115,10 @@ def _weights(place, plan, fold, heart, quiet):
       Stop: a signal ended it, and all is saved.
     """
     weights = None if plan.weights is None else Path(plan.weights)
-    if train.run_name(weights) != plan.start and plan.weights is not None:
-        raise ValueError(f"{weights}: is another file than when this was planned; put it back, or plan anew.")
+    used = weights if weights is not None or plan.steps else shipped_weights()
+    for file, digest in ((used, plan.start), (plan.lpips, plan.judge)):
+        if train.run_name(file) != digest:
+            raise ValueError(f"{file}: is another file than when this was planned; put it back, or plan anew.")
     if plan.steps:
         heart.stage, options = "train", train.TrainOptions(
             place.fold / "train", preset=plan.preset, system=fold.system, steps=plan.steps, minutes=plan.minutes,

@@ -24,7 +24,7 @@ from zestjax.io.reading import read_json
 
 BEAT_SECONDS = 2.0  # small beside a fold, and what is written is a line
 STATES = ("done", "failed", "running", "stopped", "waiting")
-SCORING_SHARE = 0.1  # of a fold's seconds, while none has ended to tell
+SCORING_SHARE = 0.1  # of a fold's training, about
 
 
 class Place:
@@ -41,13 +41,14 @@ class Place:
 
 class State(NamedTuple):
     """state: of `STATES`. stage: `train`, `finetune` or `evaluate`, of one that has begun. step, steps: of training, of
-    how many. seconds: worked on so far. reason: why it failed."""
+    how many at most. seconds: worked on so far. pace: seconds of a step, of late. reason: why it failed."""
 
     state: str
     stage: str | None = None
     step: int = 0
     steps: int = 0
     seconds: float = 0.0
+    pace: float | None = None
     reason: str | None = None
 
 
@@ -85,8 +86,11 @@ def state_of(out, plan, fold):
     with locked(place.lock) as held:
         alive = worked_on(place, held)
     logged = read_log(place.fold / "train/log.jsonl")[0] if place.fold.exists() else []
-    step = logged[-1]["step"] if logged else 0
-    return State("running" if alive else "stopped", beat.get("stage"), step, plan.steps, beat.get("seconds", 0.0))
+    last, state = logged[-1] if logged else {}, "running" if alive else "stopped"
+    step, pace, steps = last.get("step", 0), last.get("seconds_per_step"), plan.steps
+    if plan.minutes and pace:
+        steps = min(steps, step + max(0, round((60 * plan.minutes - last["seconds"]) / pace)))
+    return State(state, beat.get("stage"), step, steps, beat.get("seconds", 0.0), pace)
 
 
 def read_record(path):
@@ -184,8 +188,8 @@ def seconds_left(states, expected):
 
 
 def _left(state, expected):
-    """Seconds left of one fold: by its steps where it has taken some, else by what was expected."""
-    if state.step and state.stage == "train":
-        whole = state.seconds * state.steps / state.step / (1 - SCORING_SHARE)
-        return max(0.0, whole - state.seconds)
+    """Seconds left of one fold: by the pace of its steps if it trains, else by what was expected."""
+    if state.stage == "train" and state.pace:
+        rest = (state.steps - state.step) * state.pace
+        return rest + SCORING_SHARE * (state.seconds + rest)
     return None if expected is None else max(0.0, expected - state.seconds)

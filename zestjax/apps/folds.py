@@ -87,7 +87,7 @@ class Plan:
             varied = [
                 f"{n}={v}" for (n, v), (_, all_of_it) in zip(settings, self.settings, strict=True) if all_of_it[1:]
             ]
-            row = ",".join([system, *varied])
+            row = ",".join([system, *varied]).replace("/", "_")
             variant = f"{row},seed={self.seed + seed}" if self.seeds > 1 else row
             for name, scene in zip(names, self.scenes, strict=True):
                 others = tuple(other for other in self.scenes if other != scene)
@@ -215,7 +215,9 @@ def _scene_name(folder):
 
 def _short_names(places):
     """A name for each place that no other has: as much of its end as that takes."""
-    parts = [(place.removeprefix("bench:"),) if place.startswith("bench:") else Path(place).parts for place in places]
+    parts = [
+        (place.removeprefix("bench:"),) if place.startswith("bench:") else Path(place).parts[1:] for place in places
+    ]
     for depth in range(1, max(map(len, parts), default=1) + 1):
         names = ["-".join(part[-depth:]) for part in parts]
         if not _twice(names) and "dense" not in names:
@@ -226,8 +228,15 @@ def _short_names(places):
 def _made(given):
     """Given choices in the form that a plan has."""
     given = dict(given)
+    for name in ("scenes", "systems"):
+        if isinstance(given.get(name), str):
+            given[name] = (given[name],)
     if "scenes" in given:
         given["scenes"] = scenes_of(given["scenes"])
+    if "settings" in given:
+        texts = lambda values: tuple(map(str, values)) if isinstance(values, list | tuple) else (str(values),)
+        each = given["settings"].items() if isinstance(given["settings"], dict) else given["settings"]
+        given["settings"] = tuple((name, texts(values)) for name, values in each)
     for name in ("weights", "lpips"):
         if given.get(name) is not None:
             given[name] = str(resolved(given[name]))
