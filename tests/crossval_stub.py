@@ -22,7 +22,7 @@ from zestjax.apps import evaluate, launchers, train
 from zestjax.apps.cli import main
 from zestjax.base.parts import to_stored
 from zestjax.io.files import append_bytes, write_bytes
-from zestjax.io.weights import save_weights
+from zestjax.io.weights import WeightsError, save_weights
 from zestjax.train.recipes import TINY, recipe_of
 from zestjax.train.settings import with_settings
 
@@ -36,8 +36,8 @@ def stub_train(options):
     (scene,) = held
     if scene == os.environ.get("STUB_FAILS"):
         raise ValueError("the loss was not finite")
-    if scene == os.environ.get("STUB_FULL"):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(out))
+    if scene == os.environ.get("STUB_FULL"):  # as `save_weights` tells it
+        raise WeightsError(f"{out}: {os.strerror(errno.ENOSPC)}; free some space") from OSError(errno.ENOSPC, "full")
     step = int((out / "step").read_text()) if (out / "step").exists() else 0
     with open(out / "starts", "a") as file:
         file.write(f"{step} ")

@@ -42,7 +42,7 @@ def crossval(out, *, launcher="inline", jobs=None, failed=False, quiet=True, slu
 
     Raises:
       ValueError: choices that cannot be, or others than the folder's plan has.
-      OSError: no room is left.
+      OSError, WeightsError: no room is left.
     """
     check_option("crossval", launcher=(launcher, tuple(LAUNCHERS)))
     keep_compiled()

@@ -53,7 +53,7 @@ def run_fold(out, plan, fold, *, failed=False, quiet=False):
 
     Raises:
       ValueError: the folder holds a result of another fold, or meanwhile another plan.
-      OSError: no room is left; run it again with room, and it goes on.
+      OSError, WeightsError: no room is left; run it again with room, and it goes on.
     """
     place = Place(out, fold)
     if finished(out, plan, fold):
@@ -90,7 +90,7 @@ def _worked(place, plan, fold, heart, quiet):
         _finish(place, plan, fold, weights, heart)
         return "done"
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in OUT_OF_ROOM:
+        if _out_of_room(error):
             raise
         told = {
             "reason": f"{type(error).__name__}: {' '.join(str(error).split())}", "stage": heart.stage,
@@ -99,6 +99,13 @@ def _worked(place, plan, fold, heart, quiet):
         }  # fmt: skip
         write_bytes(place.failed, (json.dumps(told, indent=1) + "\n").encode())
         return "failed"
+
+
+def _out_of_room(error):
+    """Whether an error is, or comes from, the place having no room."""
+    while error is not None and not (isinstance(error, OSError) and error.errno in OUT_OF_ROOM):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _check_scored(plan, fold):
