@@ -29,11 +29,12 @@ SLURM_TIMEOUTS = 1000  # how often that may be: the folds' own steps end them
 
 def inline(out, plan, folds, *, failed=False, quiet=False, **_):
     """One fold after the other, in this process."""
-    for fold in folds:
-        outcome = run_fold(out, plan, fold, failed=failed, quiet=quiet)
-        _say(out, plan, fold, quiet)
-        if outcome == "stopped":
-            return
+    with contextlib.suppress(KeyboardInterrupt), stopped_by_signals():
+        for fold in folds:
+            outcome = run_fold(out, plan, fold, failed=failed, quiet=quiet)
+            _say(out, plan, fold, quiet)
+            if outcome == "stopped":
+                return
 
 
 def process(out, plan, folds, *, jobs=None, failed=False, quiet=False, **_):
