@@ -85,5 +85,5 @@ def test_a_fixed_view_of_zest_bench_is_the_same(folder):
 
 def test_photographs_alone_have_no_fixed_view(tmp_path):
     write_nsff(tmp_path / "toy", "toy", make_video())
-    with pytest.raises(ValueError, match="has no pictures of other cameras .* none of a fixed one; use `strict`"):
+    with pytest.raises(ValueError, match="has no pictures of other cameras .* for `fixed-view`; use `strict`"):
         load_scene(tmp_path / "toy", protocol="fixed-view")

@@ -140,10 +140,9 @@ def load_scene(
     path, layout = _found(path, layout)
     record = LAYOUTS[layout][1](path)
     record = record.first(FIXED_VIEW_FRAMES) if protocol == "fixed-view" else record
-    if protocol == "fixed-view" and not record.held_out:
-        raise ValueError(f"{path}: has no pictures of other cameras (mv_images), so none of a fixed one; use `strict`.")
-    if protocol == "held-out" and not (record.held_out or record.reserved):
-        raise ValueError(f"{path}: has no pictures of other cameras (mv_images), so no held-out target; use `strict`.")
+    asked = {"held-out": record.held_out or record.reserved, "fixed-view": record.held_out}
+    if protocol in asked and not asked[protocol]:
+        raise ValueError(f"{path}: has no pictures of other cameras (mv_images) for `{protocol}`; use `strict`.")
     if outside := [i for i in exclude if not 0 <= i < len(record.images)]:
         raise ValueError(f"{path}: no frame {outside[0]} to exclude; the video has 0 to {len(record.images) - 1}.")
     shown = [i for i in range(len(record.images)) if i not in set(exclude)]
