@@ -138,11 +138,7 @@ def load_scene(
     path = Path(path)
     check_option("load_scene", protocol=(protocol, PROTOCOLS))
     path, layout = _found(path, layout)
-    record = LAYOUTS[layout][1](path)
-    record = record.first(FIXED_VIEW_FRAMES) if protocol == "fixed-view" else record
-    asked = {"held-out": record.held_out or record.reserved, "fixed-view": record.held_out}
-    if protocol in asked and not asked[protocol]:
-        raise ValueError(f"{path}: has no pictures of other cameras (mv_images) for `{protocol}`; use `strict`.")
+    record = _asked_of(path, LAYOUTS[layout][1](path), protocol)
     if outside := [i for i in exclude if not 0 <= i < len(record.images)]:
         raise ValueError(f"{path}: no frame {outside[0]} to exclude; the video has 0 to {len(record.images) - 1}.")
     shown = [i for i in range(len(record.images)) if i not in set(exclude)]
@@ -167,6 +163,15 @@ def load_scene(
         layout=record.layout,
         stored=stored,
     )
+
+
+def _asked_of(path, record, protocol):
+    """What of a record a protocol looks at, if it has targets for it."""
+    record = record.first(FIXED_VIEW_FRAMES) if protocol == "fixed-view" else record
+    others = protocol in ("held-out", "fixed-view")
+    if others and not record.held_out and not (protocol == "held-out" and record.reserved):
+        raise ValueError(f"{path}: has no pictures of other cameras (mv_images) for `{protocol}`; use `strict`.")
+    return record
 
 
 def _found(path, layout):
