@@ -375,7 +375,23 @@ def test_slurm_gets_an_array_of_what_is_left_and_finds_its_jobs_again(tmp_path, 
     (tmp_path / "slurm/jobs.json").write_text('{"1": "8_0"}')
     assert run(tmp_path, *given, "--failed", "--quiet") == 1 and scheduler.submitted == 3  # it is in the queue already
     capsys.readouterr()
-    refused(capsys, run(tmp_path, *given, "--failed", "--slurm", "colour=red", "--quiet"), "--slurm", "slurm_colour")
+    refused(capsys, run(tmp_path, *given, "--failed", "--slurm", "colour=red", "--quiet"), "SLURM refuses", "colour")
+
+
+def test_what_slurm_says_is_one_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin/squeue").write_text("#!/bin/sh\necho 'Unable to contact\nslurm controller' >&2; exit 1\n")
+    (tmp_path / "bin/squeue").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    monkeypatch.setattr(launchers, "_submitit", Scheduler)
+    refused(capsys, run(tmp_path / "out", *GIVEN, "--launcher", "slurm"), "does not answer: Unable to contact slurm")
+    monkeypatch.setattr(launchers, "_queue", lambda *_: set())
+
+    def fail(*_):
+        raise RuntimeError("invalid\npartition")
+
+    monkeypatch.setattr(Scheduler, "submit", fail)
+    refused(capsys, run(tmp_path / "out", *GIVEN, "--launcher", "slurm"), "SLURM refuses: invalid partition")
 
 
 def test_slurm_that_is_not_there_is_one_line(tmp_path, monkeypatch, capsys):

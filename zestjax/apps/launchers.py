@@ -13,16 +13,16 @@ import sys
 import threading
 import time
 from importlib import import_module
-from pathlib import Path
 
 from zestjax.apps.fold_run import run_fold, stopped_by_signals
-from zestjax.apps.fold_state import Place, read_record, state_of
+from zestjax.apps.fold_state import Place, locked, read_record, state_of
 from zestjax.apps.run_folder import threads
 from zestjax.io.files import resolved, write_bytes
 
 RUN_AGAIN = 75  # EX_TEMPFAIL of sysexits.h: nothing is wrong, and a second time goes on
 POLL_SECONDS = 0.2  # of processes
 QUEUE_SECONDS = 3.0  # of SLURM's queue, which is asked once for all folds
+SUBMIT_SECONDS = 60.0  # another launcher of the folder may be submitting
 SLURM_MINUTES = 24 * 60  # of a job by default; one that runs out is requeued and goes on
 SLURM_TIMEOUTS = 1000  # how often that may be: the folds' own steps end them
 
@@ -82,20 +82,9 @@ def slurm(out, plan, folds, *, jobs=None, failed=False, quiet=False, options=(),
     Raises:
       ValueError: there is no submitit or no SLURM, or an option that it does not have.
     """
-    submitit, record = _submitit(), Path(out) / "slurm" / "jobs.json"
-    queued = _queue()
-    jobs_of = {index: job for index, job in read_record(record).items() if job in queued}
-    if new := [fold for fold in folds if str(fold.index) not in jobs_of]:
-        executor = submitit.AutoExecutor(resolved(out) / "slurm", cluster="slurm", slurm_max_num_timeout=SLURM_TIMEOUTS)
-        wanted = {"time": SLURM_MINUTES, "array_parallelism": jobs or len(new)} | dict(options)
-        try:
-            executor.update_parameters(name="zestjax", **{f"slurm_{name}": value for name, value in wanted.items()})
-        except (ValueError, NameError) as error:
-            raise ValueError(f"crossval: --slurm: {' '.join(str(error).split())}") from error
-        with executor.batch():
-            started = [executor.submit(SlurmFold(command_of(out, fold, failed))) for fold in new]
-        jobs_of |= {str(fold.index): job.job_id for fold, job in zip(new, started, strict=True)}
-        write_bytes(record, json.dumps(jobs_of).encode())
+    folder = resolved(out) / "slurm"
+    with locked(folder / "lock", patience=SUBMIT_SECONDS):
+        jobs_of = _submitted(out, folder, folds, jobs=jobs, failed=failed, options=options)
     with contextlib.suppress(KeyboardInterrupt), stopped_by_signals():
         while jobs_of:
             time.sleep(QUEUE_SECONDS)
@@ -103,6 +92,26 @@ def slurm(out, plan, folds, *, jobs=None, failed=False, quiet=False, options=(),
             for index in [index for index, job in jobs_of.items() if job not in queued]:
                 del jobs_of[index]
                 _say(out, plan, plan.folds[int(index)], quiet)
+
+
+def _submitted(out, folder, folds, *, jobs, failed, options):
+    """{index of a fold: its job} of those in the queue, among them the folds given, once they are submitted."""
+    submitit, queued, record = _submitit(), _queue(), folder / "jobs.json"
+    jobs_of = {index: job for index, job in read_record(record).items() if job in queued}
+    new = [fold for fold in folds if str(fold.index) not in jobs_of]
+    wanted = {"time": SLURM_MINUTES, "array_parallelism": jobs or len(new)} | dict(options)
+    if not new:
+        return jobs_of
+    try:
+        executor = submitit.AutoExecutor(folder, cluster="slurm", slurm_max_num_timeout=SLURM_TIMEOUTS)
+        executor.update_parameters(name="zestjax", **{f"slurm_{name}": value for name, value in wanted.items()})
+        with executor.batch():
+            started = [executor.submit(SlurmFold(command_of(out, fold, failed))) for fold in new]
+    except (ValueError, NameError, RuntimeError) as error:  # submitit's; what sbatch says is a RuntimeError
+        raise ValueError(f"crossval: SLURM refuses: {' '.join(str(error).split())}") from error
+    jobs_of |= {str(fold.index): job.job_id for fold, job in zip(new, started, strict=True)}
+    write_bytes(record, json.dumps(jobs_of).encode())
+    return jobs_of
 
 
 class SlurmFold:
@@ -137,17 +146,19 @@ def _submitit():
         raise ValueError("crossval: --launcher slurm needs submitit; pip install 'zestjax[slurm]'.") from error
 
 
-def _queue(unknown=()):
-    """Ids of this user's jobs in SLURM's queue; `unknown` where it does not answer.
+def _queue(unknown=None):
+    """Ids of this user's jobs in SLURM's queue; `unknown`, if given, where it does not answer.
 
     Raises:
-      ValueError: there is no SLURM on this machine.
+      ValueError: there is no SLURM on this machine, or it does not answer.
     """
     try:
         told = subprocess.run(["squeue", "--me", "-h", "-r", "-o", "%i"], capture_output=True, text=True)
     except FileNotFoundError as error:
         raise ValueError("crossval: --launcher slurm: no `squeue` on this machine; run it where SLURM is.") from error
-    return set(told.stdout.split()) if told.returncode == 0 else set(unknown)
+    if told.returncode and unknown is None:
+        raise ValueError(f"crossval: --launcher slurm: SLURM does not answer: {' '.join(told.stderr.split())}")
+    return set(unknown or ()) if told.returncode else set(told.stdout.split())
 
 
 def _say(out, plan, fold, quiet, more=""):
