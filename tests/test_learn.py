@@ -359,10 +359,10 @@ def test_a_stage_that_there_is_not_is_refused():
 def test_what_is_not_finite_of_a_step_is_named_by_loss_frame_and_parameter():
     batch, params = stage.batch(MINI), stage.params_of(MINI)
     sound = find_fault(stage.objective(MINI), params, batch)
-    assert sound == Fault((), (), int(batch.inputs.time))
+    assert sound == Fault((), (), (int(batch.inputs.time),))
     colour = np.array(batch.truth.colour)
     colour[0] = np.nan
     fault = find_fault(stage.objective(MINI), params, batch._replace(truth=batch.truth._replace(colour=colour)))
     assert "rec" in fault.terms and "flow3d" not in fault.terms
-    assert fault.frame == int(batch.inputs.time) and any("static" in leaf for leaf in fault.leaves)
-    assert "loss rec" in str(fault) and f"target frame {fault.frame}" in str(fault)
+    assert fault.frames == (int(batch.inputs.time),) and any("static" in leaf for leaf in fault.leaves)
+    assert "loss rec" in str(fault) and f"target frame {fault.frames[0]}" in str(fault)

@@ -210,6 +210,23 @@ def frame_batch(key: jax.Array, clips: Sequence[PreparedClip], system: System) -
     return jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
 
 
+def stacked(batches: Sequence[Any]) -> Any:
+    """The batches of several clips as one, for a recipe that sees so many a step; one batch is itself.
+
+    Raises:
+      ValueError: their arrays have not the same shapes.
+    """
+    if len(batches) == 1:
+        return batches[0]
+    shapes = [jax.tree.map(np.shape, batch) for batch in batches]
+    if any(other != shapes[0] for other in shapes):
+        raise ValueError(
+            "stacked: the clips of one step differ in size or in what is known of them; bring all scenes to one size, "
+            "or set the recipe's `clips` to 1."
+        )
+    return jax.tree.map(lambda *rows: np.stack(rows), *batches)
+
+
 def _shown(clip, kind, index) -> dict[str, Any]:
     """Everything known about a target, whole image; what is not known is left out."""
     if kind == "view":

@@ -80,6 +80,36 @@ def recomputed(fn: Callable, count: int, *, where: str = "recomputed") -> Callab
     return whole
 
 
+def over_clips(objective: Callable, count: int) -> Callable:
+    """Make an objective of one clip the mean over several, found one after the other as by `in_blocks`.
+
+    Args:
+      objective: `objective(params, batch, *weights) -> (total, terms)`.
+      count: clips; every leaf of a batch then has them as a new leading axis. One clip is the objective itself.
+
+    Returns:
+      `mean(params, batch, *weights) -> (total, terms)`.
+
+    Raises:
+      ValueError: when called with a batch of another number of clips.
+    """
+    if count == 1:
+        return objective
+
+    def of_one(params, weights, batch):
+        return objective(params, jax.tree.map(lambda x: x[0], batch), *weights)
+
+    of_all = in_blocks(of_one, count, where="over_clips")
+
+    def mean(params, batch, *weights):
+        sizes = {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(batch)}
+        if sizes != {(count,)}:
+            raise ValueError(f"over_clips: the batch has leading axes {sorted(sizes)}, expected {count} clips in each.")
+        return of_all(params, weights, batch)
+
+    return mean
+
+
 def _split(data, count, where):
     """Data in equal blocks, along a new leading axis."""
     size = len(jax.tree.leaves(data)[0])

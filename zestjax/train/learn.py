@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from zestjax.base.checks import check_option
 from zestjax.base.precision import geometry_at, network_at
@@ -135,13 +136,16 @@ def _maps(system, params, batch, weights):
     return system.frames(network_at(system.precision, params), evidence)
 
 
-def train_step(objective: Callable, solver: Any, *, weights: Callable | None = None) -> Callable:
+def train_step(
+    objective: Callable, solver: Any, *, weights: Callable | None = None, axes: tuple[str, ...] = ()
+) -> Callable:
     """One step of training.
 
     Args:
       objective: `objective(params, batch) -> (total, terms)`, of `training_objective`.
       solver: `solve.Adam`, or anything with its `apply`.
       weights: of the number of the step, where they change with it; by default the objective's own.
+      axes: of the mesh that it runs on, in a `jax.shard_map`: it steps along the mean of all devices' gradients.
 
     Returns:
       `step(params, opt_state, batch) -> (params, opt_state, terms)`, pure, the terms with `total`; jit it with donated
@@ -150,7 +154,8 @@ def train_step(objective: Callable, solver: Any, *, weights: Callable | None = N
 
     def step(params, opt_state, batch):
         now = () if weights is None else (weights(opt_state.iter_num),)
-        (total, terms), grads = jax.value_and_grad(objective, has_aux=True)(params, batch, *now)
+        taught = jax.value_and_grad(objective, has_aux=True)(params, batch, *now)
+        (total, terms), grads = jax.lax.pmean(taught, axes) if axes else taught
         params, opt_state = solver.apply(params, opt_state, grads, total)
         return params, opt_state, terms | {"total": total}
 
@@ -158,17 +163,17 @@ def train_step(objective: Callable, solver: Any, *, weights: Callable | None = N
 
 
 class Fault(NamedTuple):
-    """What of a step is not finite. terms: names of losses. leaves: paths of parameters. frame: the target's time, or
-    None of a step that has no target."""
+    """What of a step is not finite. terms: names of losses. leaves: paths of parameters. frames: the targets' times,
+    none of a step that has no target."""
 
     terms: tuple[str, ...]
     leaves: tuple[str, ...]
-    frame: int | None
+    frames: tuple[int, ...]
 
     def __str__(self):
         some = lambda names: ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
         lost = f"loss {some(self.terms)}" if self.terms else "no loss"
-        where = "" if self.frame is None else f", target frame {self.frame}"
+        where = f", target frame {some(tuple(map(str, self.frames)))}" if self.frames else ""
         return f"not finite: {lost}{where}; gradient of {some(self.leaves) if self.leaves else 'no parameter'}"
 
 
@@ -178,7 +183,8 @@ def find_fault(objective: Callable, params: Any, batch: Any) -> Fault:
     named = jax.tree_util.tree_leaves_with_path(grads)
     leaves = tuple(jax.tree_util.keystr(path) for path, good in named if not good)
     lost = tuple(name for name, good in terms.items() if not good)
-    return Fault(lost, leaves, int(batch.inputs.time) if hasattr(batch, "inputs") else None)
+    times = np.ravel(batch.inputs.time) if hasattr(batch, "inputs") else ()
+    return Fault(lost, leaves, tuple(map(int, times)))
 
 
 @functools.partial(jax.jit, static_argnames="objective")

@@ -18,12 +18,14 @@ from zestjax.systems import presets
 from zestjax.systems.mvsnerf import MVSNERF, Ends, MvsNerf
 from zestjax.systems.system import Params, System
 from zestjax.train.adversary import ADV, Adversary, Opponents, opponents_of, patch_measures
+from zestjax.train.blocks import over_clips
 from zestjax.train.learn import SIMULATED_WEIGHTS, stage_weights, train_step, training_objective
 from zestjax.train.players import Player, alternate, played
 from zestjax.train.rays import MOST_RAYS, Patch, Pixels, Rays, Rows
 from zestjax.train.schedules import PRIORS, cosine, decayed_priors
 from zestjax.train.terms import measurable
 
+MOST_CLIPS = 2**8  # of a step: a file may not ask for more
 CLIP_NORM = 1.0  # of a step's gradient: a scene that is hard throws no run off
 PRIOR_STEPS = 30_000  # the released configuration's: a prior's weight falls so often, rays are mined so long
 
@@ -82,7 +84,7 @@ class Cosine:
 class Recipe:
     """How a system is trained. system. weights: `Fixed` or `Decaying`. rate: `Cosine`. rays: `Rows`, `Pixels` or
     `Patch`. blocks: parts in which rays are computed. height, width: of the clips it was made for, pixels. adversary:
-    whom its patches must please, where `adv` has a weight."""
+    whom its patches must please, where `adv` has a weight. clips: targets of a step, whose objective is their mean."""
 
     system: System
     weights: Fixed | Decaying = Fixed(pairs(SIMULATED_WEIGHTS))
@@ -92,14 +94,17 @@ class Recipe:
     height: int = 144
     width: int = 256
     adversary: Adversary | None = None
+    clips: int = 1
 
     def __post_init__(self):
-        check_counts("Recipe", blocks=(self.blocks, 1, MOST_RAYS))
+        check_counts("Recipe", blocks=(self.blocks, 1, MOST_RAYS), clips=(self.clips, 1, MOST_CLIPS))
         check_counts("Recipe", height=(self.height, 1, MOST_RAYS), width=(self.width, 1, MOST_RAYS))
         if (ADV in present(dict(self.weights.terms))) != (self.adversary is not None):
             raise ValueError("Recipe: a weight of `adv` and an `adversary` need each other; give both or neither.")
         if self.adversary is not None:
             self.adversary.check(self.rays)
+            if self.clips != 1:
+                raise ValueError(f"Recipe: `clips` is {self.clips}, an `adversary` judges 1 a step; give 1.")
 
     @property
     def own(self) -> dict[str, Callable]:
@@ -114,12 +119,13 @@ class Recipe:
         return Opponents(params, self.adversary.init(jax.random.fold_in(key, 1)))
 
     def objective(self) -> Callable:
-        """`learn.training_objective` of its weights; of opponents, `players.played`."""
+        """`learn.training_objective` of its weights, `blocks.over_clips`; of opponents, `players.played`."""
         if self.adversary is not None:
             return played(*self.opponents(steps=1))
-        return training_objective(
+        of_one = training_objective(
             self.system, weights=self.weights(0), blocks=self.blocks, own=self.own, whole=bool(self.own)
         )
+        return over_clips(of_one, self.clips)
 
     def opponents(self, *, steps: int) -> tuple[Player, Player]:
         """The players of a run of so many steps, where there is an adversary."""
@@ -132,14 +138,14 @@ class Recipe:
     def _solver(self, steps: int) -> Adam:
         return Adam(learning_rate=lambda step: self.rate(step, steps=steps), clip_norm=CLIP_NORM)
 
-    def trainer(self, *, steps: int) -> tuple[Callable, Callable]:
+    def trainer(self, *, steps: int, axes: tuple[str, ...] = ()) -> tuple[Callable, Callable]:
         """(init(params) -> opt_state, step(params, opt_state, batch) -> (params, opt_state, terms)) of a run of so many
-        steps, params as of `init`; jit the step with donated params and opt_state."""
+        steps, params as of `init`; jit the step with donated params and opt_state. axes: see `learn.train_step`."""
         if self.adversary is not None:
             return alternate(*self.opponents(steps=steps))
         solver = self._solver(steps)
         weights = self.weights if self.weights.changes else None
-        return solver.init_state, train_step(self.objective(), solver, weights=weights)
+        return solver.init_state, train_step(self.objective(), solver, weights=weights, axes=axes)
 
     def stage(self, stage: str) -> "Recipe":
         """The recipe of one of `learn.STAGES`."""
