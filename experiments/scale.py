@@ -32,7 +32,7 @@ def operations(system):
     batch = batches.batch_from_clip(jax.random.key(1), prepared, recipe)
     params = jax.eval_shape(recipe.init, jax.random.key(2))
     lowered = jax.jit(step).lower(params, jax.eval_shape(init, params), batch)
-    return (lowered.cost_analysis() or {})["flops"]
+    return float((lowered.cost_analysis() or {})["flops"])
 
 
 def days(seconds):
@@ -50,17 +50,19 @@ def main():
     known = {name: float(seconds) for name, seconds in (given.split("=") for given in options.step_seconds)}
     each = {system: operations(system) for system in SYSTEMS}
     rate = sum(each[name] for name in known) / sum(known.values())
-    steps, whole = FOLDS * (STEPS + TUNING), {"here": 0.0, "gpu": [0.0, 0.0]}
+    here = {system: known.get(system, count / rate) for system, count in each.items()}
     print("| system | GFLOP a step | s a step here | all folds here | one GPU | eight GPUs |\n" + "|---" * 6 + "|")
     for system, count in each.items():
-        here = known.get(system, count / rate)
-        gpu = [count / (1e12 * options.tflops * share) for share in options.share[::-1]]
-        whole["here"] += here * steps
-        whole["gpu"] = [a + b * steps for a, b in zip(whole["gpu"], gpu, strict=True)]
-        spans = [" to ".join(days(s * steps / n) for s in gpu) for n in (1, 8)]
-        print(f"| {system} | {count / 1e9:,.0f} | {here:.0f} | {days(here * steps)} | {spans[0]} | {spans[1]} |")
-    spans = [" to ".join(days(seconds / n) for seconds in whole["gpu"]) for n in (1, 8)]
-    print(f"| all four | | | {days(whole['here'])} | {spans[0]} | {spans[1]} |")
+        print(f"| {system} | {count / 1e9:,.0f} | {here[system]:.0f} | {row(here[system], count, options)} |")
+    print(f"| all four | | | {row(sum(here.values()), sum(each.values()), options)} |")
+
+
+def row(seconds, count, options):
+    """The last three cells, of the seconds and operations of a step."""
+    steps = FOLDS * (STEPS + TUNING)
+    on_gpu = [count / (1e12 * options.tflops * share) for share in options.share[::-1]]
+    spans = [" to ".join(days(s * steps / gpus) for s in on_gpu) for gpus in (1, 8)]
+    return " | ".join([days(seconds * steps), *spans])
 
 
 if __name__ == "__main__":
