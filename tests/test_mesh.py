@@ -5,7 +5,7 @@ import os
 import socket
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
@@ -13,7 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stage
+from safetensors.numpy import load_file
 
+from zestjax.apps.cli import main
+from zestjax.apps.hosts import run_mesh
 from zestjax.base.parts import from_stored, to_stored
 from zestjax.train.batches import stacked
 from zestjax.train.blocks import over_clips
@@ -30,20 +33,20 @@ def free_port():
         return found.getsockname()[1]
 
 
-def on_two_processes(*command):
-    """The outputs of a command run twice, with PORT, 2 and 0 or 1 after its first word."""
-    port, one_core = str(free_port()), {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1"}
-    both = [
-        subprocess.Popen([sys.executable, command[0], port, "2", index, *command[1:]], env=os.environ | one_core,
-                         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        for index in "01"
+def in_processes(commands):
+    """The outputs of Python command lines that run at once, each on one core."""
+    one_core = {"PJRT_NPROC": "1", "OMP_NUM_THREADS": "1"}
+    all_of_them = [
+        subprocess.Popen([sys.executable, *map(str, command)], env=os.environ | one_core, stdout=subprocess.PIPE,
+                         stderr=subprocess.PIPE, text=True)
+        for command in commands
     ]  # fmt: skip
     try:
-        said = [process.communicate(timeout=SECONDS) for process in both]
+        said = [process.communicate(timeout=SECONDS) for process in all_of_them]
     finally:
-        for process in both:
+        for process in all_of_them:
             process.kill()
-    assert [process.returncode for process in both] == [0, 0], said
+    assert not any(process.returncode for process in all_of_them), said
     return [out for out, _ in said]
 
 
@@ -51,7 +54,9 @@ def on_two_processes(*command):
 def test_two_processes_have_the_parameters_of_one_device(terms):
     """Three steps of Adam in float64. A gradient's rounding, 1e-16, over Adam's eps of 1e-8 moves a parameter by 1e-8
     of a rate of 1e-4: 1e-12 a step."""
-    found = json.loads(on_two_processes(CHILD, terms)[0].splitlines()[-1])  # Gloo greets on the same stream
+    port = free_port()
+    first, _ = in_processes([(CHILD, port, 2, index, terms) for index in range(2)])
+    found = json.loads(first.splitlines()[-1])  # Gloo greets on the same stream
     assert found["rays"]["mesh"] == {"clips": 1, "rays": 2} and found["clips"]["mesh"] == {"clips": 2, "rays": 1}
     for case in found.values():
         assert case["params"] < 1e-11 and case["terms"] < 1e-11 and case["moved"] > 1e-4, found
@@ -126,3 +131,54 @@ def test_the_number_of_clips_belongs_to_the_recipe():
         replace(TINY, clips=0)
     with pytest.raises(ValueError, match="judges 1 a step"):
         replace(SVS["tiny"], clips=2)
+
+
+def trained_by_command(tmp_path, out, *flags):
+    """A command line of `zestjax train`, of few terms, which compile in seconds."""
+    off = [f"weights.{term}=0" for term in ("flow3d", "frame_ce", "frame_mask")]
+    fixed = ("--preset", "tiny", "--system", "zest-none", "--steps", "6", "--clip-count", "2", "--set", "clips=2", *off)
+    places = ("--clips", tmp_path / "clips", "--out", tmp_path / out)
+    return ("-m", "zestjax.apps.cli", "train", *fixed, *places, *flags)
+
+
+@pytest.mark.slow
+def test_a_run_on_two_processes_is_one_run(tmp_path, monkeypatch):
+    """What one writes the first of two writes, and the other leaves nothing; parameters agree to roundings of 2."""
+    (tmp_path / "scratch").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "scratch"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    in_processes([trained_by_command(tmp_path, "alone")])
+    at = f"127.0.0.1:{free_port()},2"
+    in_processes([trained_by_command(tmp_path, "both", "--hosts", f"{at},{index}") for index in range(2)])
+    alone, both = (load_file(tmp_path / out / "weights.safetensors") for out in ("alone", "both"))
+    assert max(np.abs(alone[name] - both[name]).max() for name in alone) < 1e-6
+    assert {path.name for path in (tmp_path / "both").iterdir()} == {
+        path.name for path in (tmp_path / "alone").iterdir()
+    }
+    assert not list((tmp_path / "scratch").glob("zestjax-*"))
+    (told,) = in_processes([trained_by_command(tmp_path, "both", "--resume")])
+    assert "nothing was left to do" in told  # one device goes on with what several began
+
+
+@pytest.mark.parametrize("given", ["nowhere", "127.0.0.1:5000,2", "127.0.0.1:5000,2,2", "h:0,1,0", "h:99999,2,1", ",,"])
+def test_hosts_that_cannot_be_are_one_line(given, tmp_path, capsys):
+    assert main(["train", "--out", str(tmp_path / "out"), "--hosts", given]) == 2
+    assert capsys.readouterr().err.startswith(f"error: train: --hosts is {given}, expected HOST:PORT,COUNT,INDEX")
+
+
+def test_a_process_that_is_alone_takes_as_many_devices_as_have_equal_parts(monkeypatch, capsys):
+    @dataclass(frozen=True)
+    class Device:
+        id: int
+        platform: str
+        process_index: int = 0
+
+    def taken(count, platform, quiet=False):
+        monkeypatch.setattr(jax, "devices", lambda: [Device(i, platform) for i in range(count)])
+        mesh = run_mesh(ZEST, quiet=quiet)
+        return 1 if mesh is None else mesh.size
+
+    assert taken(4, "cuda") == 4 and taken(2, "cpu") == 1 and not capsys.readouterr().err
+    assert taken(3, "cuda") == 2
+    assert capsys.readouterr().err == "train: uses 2 of 3 devices: a step has clips=1, blocks=4\n"
+    assert taken(3, "cuda", quiet=True) == 2 and not capsys.readouterr().err

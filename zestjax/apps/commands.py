@@ -88,6 +88,7 @@ def _train(commands):
     command.add_argument("--window", type=positive, default=16, help="clips alive at a time (default 16)")
     command.add_argument("--steps-per-clip", type=positive, default=4, help="steps until a new clip joins (default 4)")
     command.add_argument("--checkpoint-minutes", type=positive_float, default=5.0)
+    command.add_argument("--hosts", metavar="HOST:PORT,COUNT,INDEX", help="one of COUNT processes that share each step")
 
 
 def _finetune(commands):

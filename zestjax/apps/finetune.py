@@ -21,6 +21,7 @@ from zestjax.apps.train import run_name, summarise
 from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.base.parts import to_stored
 from zestjax.frames.known import answers_of
+from zestjax.train.batches import step_batches
 from zestjax.train.learn import find_fault
 from zestjax.train.recipes import Cosine
 from zestjax.train.training import TrainState
@@ -85,7 +86,8 @@ def finetune(options):
         "scene": place_of(options.scene),
         "data": {"frames": digest(video), "exclude": list(options.exclude)},
     }  # fmt: skip
-    batch_at = own_frame_batches(known, recipe, seed=options.seed, exclude=options.exclude)
+    one_at = own_frame_batches(known, recipe, seed=options.seed, exclude=options.exclude)
+    batch_at = step_batches(one_at, recipe.clips)
     step_fn = jax.jit(step_fn, donate_argnums=(0, 1))
     result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "finetune")

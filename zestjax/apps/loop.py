@@ -16,6 +16,7 @@ from typing import NamedTuple
 from tqdm import tqdm
 
 from zestjax.apps import run_folder
+from zestjax.apps.hosts import anywhere, begun_by_first
 from zestjax.apps.log import Recorder, draw_curve, read_log
 from zestjax.io.files import append_bytes
 from zestjax.train.training import TrainState, training_steps
@@ -76,7 +77,8 @@ def run_loop(step_fn, start, batch_at, options, *, metadata, explain=None):
     """
     out = Path(options.out)
     with run_folder.held(out):
-        begun = run_folder.restore(start, out, metadata) if options.resume else run_folder.begin(start, out)
+        restore = lambda: run_folder.restore(start, out, metadata)
+        begun = begun_by_first(restore if options.resume else lambda: run_folder.begin(start, out))
         out_of_time = options.seconds is not None and begun.seconds >= options.seconds
         if begun.state.step >= options.steps or out_of_time:
             return _ended(out, begun)
@@ -94,7 +96,7 @@ def _run(step_fn, begun, batch_at, options, metadata, explain):
     """`run_loop` from a state on, in a folder that is held."""
     out, state, first = Path(options.out), begun.state, begun.state.step
     recorder, clock = Recorder(out / "log.jsonl", options.log_steps), _Clock(begun.seconds, options)
-    faults = _Faults(out, state, explain)
+    faults, asked = _Faults(out, state, explain), False
     with _StopOnSignal() as stop, _bar(first, options) as bar:
         try:
             for state, info in training_steps(step_fn, begun.state, batch_at, steps=options.steps):
@@ -102,7 +104,8 @@ def _run(step_fn, begun, batch_at, options, metadata, explain):
                 recorder.add(state.step, info, clock)
                 faults.see(state, batch_at)
                 _show(bar, recorder, clock)
-                done = stop.asked or clock.over() or state.step == options.steps
+                asked, over = anywhere(stop.asked, clock.over())
+                done = asked or over or state.step == options.steps
                 if done or clock.checkpoint_due():
                     recorder.flush()
                     run_folder.save(out, state, metadata, clock.seconds)
@@ -116,7 +119,7 @@ def _run(step_fn, begun, batch_at, options, metadata, explain):
                 _rescue(out, recorder, state, metadata, clock.seconds)
             raise
     recorder.draw(out / "curve.png", least_seconds=0)
-    finished = state.step == options.steps or not stop.asked
+    finished = state.step == options.steps or not asked
     return LoopResult(state, clock.seconds, clock.compile_seconds, recorder.last, finished, state.step - first)
 
 

@@ -29,8 +29,8 @@ def known_of(scene: Scene) -> KnownFrames:
 
 
 def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
-    """step -> batch: a hole of the step's group, predicted from the frames that are neither holes nor excluded; of a
-    system that reads no frames, any that is not excluded.
+    """(step, draw=0) -> batch: a hole of the step's group, predicted from the frames that are neither holes nor
+    excluded; of a system that reads no frames, any that is not excluded.
 
     Args:
       known: `KnownFrames`.
@@ -58,8 +58,8 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
     reading = any(map(reads_frames, (recipe.system.static, recipe.system.dynamic)))
     by_heart = PreparedClip(known, None, (), tuple(exclude), tuple(map(int, usable)))
 
-    def batch_at(step):
+    def batch_at(step, draw=0):
         chosen = prepared(step // STEPS_PER_HOLES) if reading else by_heart
-        return batch_from_clip(batch_key(step, seed=seed), chosen, recipe, step=step)
+        return batch_from_clip(batch_key(step, seed=seed, draw=draw), chosen, recipe, step=step)
 
     return batch_at

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import sys
 import time
@@ -15,6 +14,7 @@ import jax
 import zestjax
 from zestjax.apps.cache import STALE_DAYS, held_clips, remove_stale_clips
 from zestjax.apps.clips import EVIDENCE, ClipSpec, clip_folder, hole_key
+from zestjax.apps.hosts import is_first, join, run_mesh, run_place
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.own_frames import known_of, own_frame_batches
 from zestjax.apps.producer import ClipSource
@@ -25,8 +25,16 @@ from zestjax.base.checks import check_option
 from zestjax.base.parts import to_stored
 from zestjax.frames.evidence import Evidence
 from zestjax.frames.known import answers_of, shared
-from zestjax.train.batches import PreparedClip, batch_from_clip, clip_from_arrays, frame_batch, prepare_clip
+from zestjax.train.batches import (
+    PreparedClip,
+    batch_from_clip,
+    clip_from_arrays,
+    frame_batch,
+    prepare_clip,
+    step_batches,
+)
 from zestjax.train.learn import STAGES, find_fault, stage_weights
+from zestjax.train.mesh import mesh_trainer
 from zestjax.train.recipes import RECIPES, SYSTEMS, recipe_of
 from zestjax.train.settings import with_settings
 from zestjax.train.terms import measurable, unmeasured
@@ -49,6 +57,7 @@ class TrainOptions:
     next. scenes: folders (or `bench:NAME`) whose own frames are predicted from one another; no simulated clips.
     checkpoint_minutes: between two checkpoints. system: one of `recipes.SYSTEMS`. stage: one of `learn.STAGES`.
     peak: highest learning rate, by default the recipe's. settings: (name, value) of `settings.with_setting` each.
+    hosts: see `hosts.join`; the devices of all processes share every step.
     """
 
     out: Path
@@ -71,6 +80,7 @@ class TrainOptions:
     peak: float | None = None
     precision: str = "float32"
     settings: tuple = ()
+    hosts: str | None = None
 
 
 class Summary(NamedTuple):
@@ -91,6 +101,7 @@ def train(options):
     Raises:
       ValueError, WeightsError: bad options; the folder holds another run; a damaged checkpoint.
     """
+    join(options.hosts)
     check_option("train", system=(options.system, SYSTEMS), stage=(options.stage, STAGES))
     check_option("train", precision=(options.precision, ("float32", "bfloat16")))
     if options.scenes and options.stage == "frames":
@@ -103,12 +114,11 @@ def train(options):
     recipe = run_recipe(whole, options, known=answers_of(frames[0]) if frames else None)
     metadata = run_metadata(recipe, options, frames)
     state, step_fn = fresh(recipe, options)
-    limit = None if options.minutes is None else 60 * options.minutes
-    loop = LoopOptions(
-        options.out, options.steps, limit, options.resume, 60 * options.checkpoint_minutes, quiet=options.quiet
-    )
-    explain = functools.partial(find_fault, recipe.objective())
-    with batches(recipe, options, frames) as batch_at:
+    limit, quiet = None if options.minutes is None else 60 * options.minutes, options.quiet or not is_first()
+    objective = recipe.objective()
+    explain = lambda params, batch: find_fault(objective, jax.device_get(params), batch)
+    with run_place(options.out) as out, batches(recipe, options, frames) as batch_at:
+        loop = LoopOptions(out, options.steps, limit, options.resume, 60 * options.checkpoint_minutes, quiet=quiet)
         result = run_loop(step_fn, state, batch_at, loop, metadata=metadata, explain=explain)
     return summarise(result, options.out, "train")
 
@@ -144,8 +154,12 @@ def fresh(recipe, options):
             raise ValueError(f"train: --analysis is of maps that `{options.system}` does not ask for; drop it.")
         other: Any = load_params(options.analysis, like=params)
         params = params._replace(analysis=other.analysis)
-    init, step_fn = recipe.trainer(steps=options.steps)
-    return TrainState(params, init(params), 0), jax.jit(step_fn, donate_argnums=(0, 1))
+    if mesh := run_mesh(recipe, quiet=options.quiet):
+        init, step_fn = mesh_trainer(recipe, mesh, steps=options.steps)
+    else:
+        init, step_fn = recipe.trainer(steps=options.steps)
+        step_fn = jax.jit(step_fn, donate_argnums=(0, 1))
+    return TrainState(params, init(params), 0), step_fn
 
 
 def say_removed(folders, options):
@@ -203,7 +217,8 @@ def batches(recipe, options, frames=()):
 def _scene_batches(recipe, options, frames):
     """step -> batch of one of the scenes in turn."""
     each = [own_frame_batches(known, recipe, seed=options.seed) for known in frames]
-    return lambda step: each[step % len(each)](step // len(each))
+    in_turn = lambda target: each[target % len(each)](target // len(each))
+    return step_batches(lambda step, clip: in_turn(step * recipe.clips + clip), recipe.clips)
 
 
 class _SimulatedBatches:
@@ -227,16 +242,17 @@ class _SimulatedBatches:
         )
 
     def __enter__(self):
-        return self.batch
+        return step_batches(self.batch, self.recipe.clips)
 
     def __exit__(self, *_):
         self.ends.close()
 
-    def batch(self, step):
-        key = batch_key(step, seed=self.seed)
+    def batch(self, step, clip):
+        key = batch_key(step, seed=self.seed, draw=clip)
         if self.stage == "frames":
-            return frame_batch(key, [self.prepared(step, draw) for draw in range(SCENES_PER_STEP)], self.recipe.system)
-        return batch_from_clip(key, self.prepared(step, 0), self.recipe, step=step)
+            draws = range(clip * SCENES_PER_STEP, (clip + 1) * SCENES_PER_STEP)
+            return frame_batch(key, [self.prepared(step, draw) for draw in draws], self.recipe.system)
+        return batch_from_clip(key, self.prepared(step, clip), self.recipe, step=step)
 
     def prepared(self, step, draw):
         """`PreparedClip` of one of the clips that a step sees."""

@@ -6,7 +6,7 @@ h w      cells, a quarter of the image
 planes   fractional plane index of a true depth, 0 at near
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -208,6 +208,11 @@ def frame_batch(key: jax.Array, clips: Sequence[PreparedClip], system: System) -
         parts.append(FrameBatch(jax.tree.map(lambda x, c=chosen: x[c], evidence), planes, moving,
                                 np.ones(len(chosen), np.float32)))  # fmt: skip
     return jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
+
+
+def step_batches(batch_at: Callable[[int, int], Any], clips: int) -> Callable[[int], Any]:
+    """`stacked` batches of a step's clips; batch_at: of (step, clip)."""
+    return lambda step: stacked([batch_at(step, clip) for clip in range(clips)])
 
 
 def stacked(batches: Sequence[Any]) -> Any:

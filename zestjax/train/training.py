@@ -52,9 +52,11 @@ def clip_index(
     return index if count is None else index % count
 
 
-def batch_key(step: int, *, seed: int) -> jax.Array:
-    """The random key of step `step`'s batch: which target, which rays, which slots are dropped."""
-    return jax.random.fold_in(jax.random.key(seed), step)
+def batch_key(step: int, *, seed: int, draw: int = 0) -> jax.Array:
+    """The random key of the batch of step `step`, or of its clip `draw`: which target, which rays, which slots are
+    dropped."""
+    key = jax.random.fold_in(jax.random.key(seed), step)
+    return jax.random.fold_in(key, draw) if draw else key
 
 
 def scalars(info: Tree) -> dict[str, float]:
