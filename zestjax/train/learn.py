@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from zestjax.base.checks import check_option
 from zestjax.base.precision import geometry_at, network_at
@@ -155,11 +156,17 @@ def train_step(
     def step(params, opt_state, batch):
         now = () if weights is None else (weights(opt_state.iter_num),)
         taught = jax.value_and_grad(objective, has_aux=True)(params, batch, *now)
-        (total, terms), grads = jax.lax.pmean(taught, axes) if axes else taught
+        (total, terms), grads = _mean_over(axes, taught) if axes else taught
         params, opt_state = solver.apply(params, opt_state, grads, total)
         return params, opt_state, terms | {"total": total}
 
     return step
+
+
+def _mean_over(axes, tree):
+    """Means over the devices of a mesh, sent as one vector: a message for each array costs more than what it holds."""
+    flat, unravel = ravel_pytree(tree)
+    return unravel(jax.lax.pmean(flat, axes))
 
 
 class Fault(NamedTuple):
