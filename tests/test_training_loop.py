@@ -283,6 +283,15 @@ def test_a_run_resumes_with_its_own_recipe_alone(begun, said, flags):
         resumed(begun / "run", recipe(**given | paths))
 
 
+def test_a_choice_that_came_later_is_at_its_default_in_an_older_run(begun):
+    metadata = recipe(weights=begun / "first/weights.safetensors")
+    assert metadata["recipe"].pop("clips") == 1 and metadata["recipe"].pop("adversary") is None
+    assert resumed(begun / "run", metadata).state.step == 4
+    metadata["recipe"]["clips"] = 2
+    with pytest.raises(WeightsError, match=r"another recipe \(clips\)"):
+        resumed(begun / "run", metadata)
+
+
 def test_weights_are_told_apart_by_what_they_hold(begun):
     (begun / "moved").mkdir()
     for name, content in {"same": "first", "other": "second"}.items():

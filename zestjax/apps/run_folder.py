@@ -19,9 +19,11 @@ import numpy as np
 from tqdm import tqdm
 
 from zestjax.apps.log import cut_log
+from zestjax.base.parts import from_stored, to_stored
 from zestjax.io.checkpoints import latest_checkpoint, save_checkpoint
 from zestjax.io.files import remove_parts
 from zestjax.io.weights import WeightsError, load_weights, save_weights
+from zestjax.train.recipes import PARTS
 from zestjax.train.training import TrainState
 
 IDENTITY = ("recipe", "seed", "data", "start", "analysis")  # what a run that resumes must share
@@ -164,12 +166,20 @@ def _cut_logs(out, step):
 def _differing(before, now):
     """Names of `IDENTITY` that two runs do not share; of a dict, also of its entries."""
     for name in IDENTITY:
-        old, new = before.get(name), now.get(name)
+        old, new = _completed(before.get(name)), _completed(now.get(name))
         if isinstance(old, dict) and isinstance(new, dict):
             entries = sorted(key for key in old | new if old.get(key) != new.get(key))
             yield from [f"{name} ({', '.join(entries)})"] if entries else []
         elif old != new:
             yield name
+
+
+def _completed(value):
+    """A stored part with the choices that were added since it was written, at their defaults; all else as it is."""
+    try:
+        return to_stored(from_stored(value, PARTS)) if isinstance(value, dict) and "part" in value else value
+    except ValueError:
+        return value
 
 
 def _warn(text):
