@@ -47,6 +47,8 @@ def drawn(rng, argument, kind, shape):
         return np.eye(3) + rng.uniform(-0.1, 0.1, shape)
     if kind == "point":
         return rng.uniform(-0.5, 0.5, shape) + [0, 0, 2]
+    if argument == "flow":  # no point comes next to the camera, where rounding is divided by the square of its depth
+        return rng.uniform(-0.5, 0.5, shape)
     low, high = WITHIN[kind]
     if argument == "values" and kind == "unit":  # apart from each other, as what a line is fitted to must be
         return low + (high - low) * (np.arange(shape[-1]) + rng.uniform(0, 0.5, shape)) / shape[-1]

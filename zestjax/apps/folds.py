@@ -97,12 +97,12 @@ class Plan:
     def spec(self, fold: Fold) -> dict[str, Any]:
         """All that decides a fold's numbers, as JSON has it."""
         shared = {name: value for name, value in self.stored.items() if name not in ("scenes", "systems", "seeds")}
-        return json.loads(json.dumps(shared | dataclasses.asdict(fold)))
+        return _lists(shared | dataclasses.asdict(fold))
 
     @property
     def stored(self) -> dict[str, Any]:
         """As JSON has it."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
+        return _lists(dataclasses.asdict(self))
 
     @property
     def digest(self) -> str:
@@ -254,6 +254,13 @@ def _started(given, plan):
 def _store(out, plan):
     write_bytes(out / PLAN, (json.dumps({"digest": plan.digest, "plan": plan.stored}, indent=1) + "\n").encode())
     return plan
+
+
+def _lists(value):
+    """A tree as JSON has it: tuples are lists."""
+    if isinstance(value, dict):
+        return {name: _lists(entry) for name, entry in value.items()}
+    return [_lists(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
 def _tuples(value):

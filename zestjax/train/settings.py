@@ -4,6 +4,7 @@ name   fields from the `Recipe` on, `rate.peak` or `rays.count`; or `weights.TER
 value  text: a number, `true`, `false`, `null`, `[8,12]`, or a word; of a term's weight 0 takes it out of the program
 """
 
+import ast
 import dataclasses
 import json
 from collections.abc import Iterable, Iterator
@@ -12,6 +13,8 @@ from typing import Any
 from zestjax.base.parts import from_stored, to_stored
 from zestjax.train.recipes import Recipe
 from zestjax.train.terms import KINDS, unmeasured
+
+WORDS = {"true": True, "false": False, "null": None}
 
 
 def with_settings(recipe: Recipe, settings: Iterable[tuple[str, str]]) -> Recipe:
@@ -74,15 +77,13 @@ def _choices(stored):
 
 
 def _value(text):
-    """A text's value; a word that is no JSON stays a text, also `NaN`."""
+    """A text's value; what is neither a number, a list nor one of `WORDS` stays a text, also `NaN`."""
+    if text in WORDS:
+        return WORDS[text]
     try:
-        return json.loads(text, parse_constant=lambda _: _refuse())
-    except ValueError:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
         return text
-
-
-def _refuse():
-    raise ValueError
 
 
 def _parts(value: Any) -> Iterator[type]:
