@@ -54,7 +54,7 @@ def with_setting(recipe: Recipe, name: str, text: str) -> Recipe:
     try:
         return from_stored(stored, set(_parts(recipe)))
     except ValueError as error:
-        raise ValueError(f"with_setting: {name}={text}: {error}.") from error
+        raise ValueError(f"with_setting: {name}={text}: {str(error).rstrip('.')}.") from error
 
 
 def _with_weight(recipe, term, text):
