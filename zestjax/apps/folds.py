@@ -256,7 +256,7 @@ def _store(out, plan):
     return plan
 
 
-def _lists(value):
+def _lists(value: Any) -> Any:
     """A tree as JSON has it: tuples are lists."""
     if isinstance(value, dict):
         return {name: _lists(entry) for name, entry in value.items()}
