@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from zestjax import novel_view
-from zestjax.apps.commands import size
+from zestjax.apps.commands import numbers, size
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.weights import open_weights
 from zestjax.simulate.bench import BENCH
@@ -55,7 +55,7 @@ def main():
     parser = argparse.ArgumentParser(description="Scores by how many input frames see a pixel's surface.")
     parser.add_argument("weights", nargs="+", type=Path)
     parser.add_argument("--scenes", nargs="+", default=list(BENCH), choices=BENCH)
-    parser.add_argument("--targets", type=lambda text: tuple(map(int, text.split(","))), default=(6, 16))
+    parser.add_argument("--targets", type=numbers, default=(6, 16))
     parser.add_argument("--size", type=size, default=(72, 128))
     options = parser.parse_args()
     print("| weights | seen by | share | PSNR | detail |\n|---|---|---|---|---|")

@@ -8,7 +8,6 @@ Writes `precision.md` and `precision.json`.
 """
 
 import argparse
-import json
 import time
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import jax
 import numpy as np
 
 from zestjax.apps.evaluate import Renderer, device_name
+from zestjax.apps.results import write_record
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, score_image
 from zestjax.apps.weights import arithmetic, at_precision, open_weights
@@ -104,7 +104,7 @@ def main():
     options = parser.parse_args()
     rows = measured(options)
     report = {"device": device_name(), "scenes": options.scenes, "times": options.times, "rows": rows}
-    write_bytes(options.out / "precision.json", (json.dumps(report, indent=1) + "\n").encode())
+    write_record(options.out / "precision.json", report)
     table = ["| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|", *map(line, rows)]
     write_bytes(options.out / "precision.md", ("\n".join(table) + "\n").encode())
     print(*table, sep="\n")

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 
 from zestjax.apps.progress import progress
+from zestjax.apps.results import write_record
 from zestjax.base.trees import first_nonfinite
-from zestjax.io.files import write_bytes
 from zestjax.losses.objective import PAPER_WEIGHTS
 from zestjax.simulate.clips import clip
 from zestjax.simulate.random import random_scene
@@ -139,7 +139,7 @@ def stability(options):
         "kinds": {k: {"steps": len(t), "first": float(t[: len(t) // 4].mean()), "last": float(t[-len(t) // 4 :].mean()),
                       "greatest": float(t.max())} for k, t in totals.items() if len(t)},
     }  # fmt: skip
-    write_bytes(Path(options.out) / "stability.json", (json.dumps(report, indent=1) + "\n").encode())
+    write_record(Path(options.out) / "stability.json", report)
     return report
 
 

@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from zestjax.apps.clips import ClipSpec, clip_folder, make_clip
-from zestjax.apps.commands import size
+from zestjax.apps.commands import numbers, size
 from zestjax.apps.crossval import crossval
 from zestjax.apps.crossval_table import interval
 from zestjax.apps.log import read_log
 from zestjax.apps.progress import progress
+from zestjax.apps.results import write_record
 from zestjax.apps.train import TrainOptions, train
 from zestjax.io.files import write_bytes
 from zestjax.simulate.bench import BENCH
@@ -48,7 +49,7 @@ def pace(system, options):
         run = learned(system, options.out / "pace" / system, PACE_STEPS, options)
         rows = read_log(run.parent / "log.jsonl")[0]
         known[system] = float(np.median([row["seconds_per_step"] for row in rows]))
-        write_bytes(path, (json.dumps(known, indent=1) + "\n").encode())
+        write_record(path, known)
     return known[system]
 
 
@@ -205,11 +206,12 @@ def study(options):
         render_clips(options)
     for system in options.systems:
         results[system] = measured(system, options)
-        write_bytes(options.out / "study.md", markdown(results, options).encode())
-        print(markdown(results, options), flush=True)
+        text = markdown(results, options)
+        write_bytes(options.out / "study.md", text.encode())
+        print(text, flush=True)
     found = margins(results)
     told = {"minutes": options.minutes, "size": options.size, "margins": found, "systems": results}
-    write_bytes(options.out / "study.json", (json.dumps(told, indent=1) + "\n").encode())
+    write_record(options.out / "study.json", told)
     if found:
         draw(options.out / "margins.png", found)
     return results
@@ -228,7 +230,7 @@ def parsed(arguments=None):
     parser.add_argument("--learn", choices=("simulated", "others"), default="simulated")
     parser.add_argument("--clips", type=int, default=64, help="simulated, shared by all systems")
     parser.add_argument("--size", type=size, default=(72, 128), help="HxW, of clips and pictures")
-    parser.add_argument("--targets", type=lambda text: tuple(map(int, text.split(","))), default=(4, 12, 20))
+    parser.add_argument("--targets", type=numbers, default=(4, 12, 20))
     parser.add_argument("--lpips", type=Path)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--quiet", action="store_true")

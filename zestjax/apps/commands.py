@@ -261,30 +261,35 @@ def setting(text):
 
 
 def size(text):
+    """(height, width) of HxW."""
     if not (match := re.fullmatch(r"(\d+)x(\d+)", text)) or min(int(side) for side in match.groups()) < 16:
         raise argparse.ArgumentTypeError(f"{text!r} is no size: give HxW, each at least 16")
     return int(match[1]), int(match[2])
 
 
 def numbers(text):
+    """Frame numbers i,j,... as a tuple."""
     if not re.fullmatch(r"\d+(,\d+)*", text):
         raise argparse.ArgumentTypeError(f"{text!r} is no list of frame numbers: give i,j,...")
     return tuple(int(number) for number in text.split(","))
 
 
 def natural(text):
+    """A whole number from 0."""
     if not text.isdigit():
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0")
     return int(text)
 
 
 def positive(text):
+    """A whole number from 1."""
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1")
     return int(text)
 
 
 def positive_float(text):
+    """A finite number above 0."""
     try:
         value = float(text)
     except ValueError:

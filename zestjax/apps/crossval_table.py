@@ -8,13 +8,13 @@ paired    a row's scores minus the first row's, target by target, over the targe
 
 import csv
 import io
-import json
 from pathlib import Path
 
 import numpy as np
 from scipy.special import stdtrit
 
-from zestjax.apps.fold_state import Place, finished, read_record
+from zestjax.apps.fold_state import Place, finished
+from zestjax.apps.results import read_record, write_record
 from zestjax.apps.scoring import REGIONS, number
 from zestjax.apps.tables import counted
 from zestjax.io.files import write_bytes
@@ -67,7 +67,7 @@ def write_tables(out, plan):
         "images": {row: {name: [_image(fold, t) for fold, metrics in folds for t in metrics["targets"]]
                          for name, folds in found.items()} for row, found in rows.items()},
     }  # fmt: skip
-    write_bytes(out / "table.json", (json.dumps(table, indent=1) + "\n").encode())
+    write_record(out / "table.json", table)
     for suffix, written in (("md", markdown), ("csv", comma_separated), ("tex", latex)):
         write_bytes(out / f"table.{suffix}", written(table).encode())
     return table

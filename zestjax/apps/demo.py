@@ -1,6 +1,5 @@
 """`zestjax demo`: scenes that the shipped weights have never seen, from new cameras, beside the truth and the clock."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -13,12 +12,12 @@ from zestjax.apps.evaluate import EvaluateOptions, Renderer, floor_images, score
 from zestjax.apps.paths import camera_path
 from zestjax.apps.progress import progress
 from zestjax.apps.report import write_report
+from zestjax.apps.results import write_record
 from zestjax.apps.scenes import BENCH_SIZE, open_scene
 from zestjax.apps.scoring import number, score_depth
 from zestjax.apps.stereo import stereo_scene
 from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.io.figures import depth_picture, error_picture, share_picture, side_by_side
-from zestjax.io.files import write_bytes
 from zestjax.io.pictures import write_image
 from zestjax.io.scenes import Target
 from zestjax.io.video import write_video
@@ -46,7 +45,7 @@ def demo(out, *, quiet=False, weights=None):
     (report, film), seconds = timed(lambda: _bench(model, options, out, quiet))
     report["stereo"], report["stereo"]["total_seconds"] = timed(lambda: _stereo(model, out))
     report["total_seconds"] = number(seconds + report["stereo"]["total_seconds"])
-    write_bytes(out / "metrics.json", (json.dumps(report, indent=1) + "\n").encode())
+    write_record(out / "metrics.json", report)
     page = write_report(out, report, film)
     mean = report["mean"]
     return (

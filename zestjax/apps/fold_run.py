@@ -7,7 +7,6 @@ checkpoint, and only one process works on it at a time. It may be killed at any 
 import contextlib
 import errno
 import importlib.metadata
-import json
 import math
 import os
 import platform
@@ -20,13 +19,14 @@ from pathlib import Path
 import zestjax
 from zestjax.apps import evaluate, finetune, run_folder, train
 from zestjax.apps.clips import code_digest
-from zestjax.apps.fold_state import Heart, Place, finished, locked, read_record, worked_on
+from zestjax.apps.fold_state import Heart, Place, finished, locked, worked_on
 from zestjax.apps.folds import read_plan
 from zestjax.apps.memory import peak_megabytes, reset_peak
+from zestjax.apps.results import read_record, write_record
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.weights import open_weights, shipped_weights
 from zestjax.base.parts import to_stored
-from zestjax.io.files import remove_parts, write_bytes
+from zestjax.io.files import remove_parts
 from zestjax.train.recipes import recipe_of
 
 OUT_OF_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)  # of the place: no fold's fault, and every other's end too
@@ -97,7 +97,7 @@ def _worked(place, plan, fold, heart, quiet):
             "seconds": round(heart.seconds, 1), "host": socket.gethostname(), "written": _now(),
             "traceback": traceback.format_exc(),
         }  # fmt: skip
-        write_bytes(place.failed, (json.dumps(told, indent=1) + "\n").encode())
+        write_record(place.failed, told)
         return "failed"
 
 
@@ -170,7 +170,7 @@ def _finish(place, plan, fold, weights, heart):
     metrics = read_record(place.fold / "metrics.json")
     if weights is not None and weights.is_relative_to(place.fold):
         metrics["weights"] = str(place.result / weights.relative_to(place.fold))
-        write_bytes(place.fold / "metrics.json", (json.dumps(metrics, indent=1) + "\n").encode())
+        write_record(place.fold / "metrics.json", metrics)
     told = {
         "spec": plan.spec(fold), "plan": plan.digest, "recipe": to_stored(model.recipe), "seed": fold.seed,
         "seconds": round(heart.seconds, 1), "peak_megabytes": peak_megabytes(), "device": metrics.get("device"),
@@ -178,7 +178,7 @@ def _finish(place, plan, fold, weights, heart):
         "code": code_digest("**/*.py"), "python": platform.python_version(), "libraries": libraries(),
         "written": _now(),
     }  # fmt: skip
-    write_bytes(place.fold / "fold.json", (json.dumps(told, indent=1) + "\n").encode())
+    write_record(place.fold / "fold.json", told)
     place.result.parent.mkdir(parents=True, exist_ok=True)
     os.rename(place.fold, place.result)
 

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from zestjax.apps.log import read_log
+from zestjax.apps.results import read_record
 from zestjax.io.files import write_bytes
-from zestjax.io.reading import read_json
 
 BEAT_SECONDS = 2.0  # small beside a fold, and what is written is a line
 STATES = ("done", "failed", "running", "stopped", "waiting")
@@ -91,15 +91,6 @@ def state_of(out, plan, fold):
     if plan.minutes and pace:
         steps = min(steps, step + max(0, round((60 * plan.minutes - last["seconds"]) / pace)))
     return State(state, beat.get("stage"), step, steps, beat.get("seconds", 0.0), pace)
-
-
-def read_record(path):
-    """The dict of a small JSON file of ours; empty where there is none that can be read."""
-    try:
-        told = read_json(path)
-    except (OSError, ValueError):
-        return {}
-    return told if isinstance(told, dict) else {}
 
 
 @contextlib.contextmanager

@@ -13,11 +13,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from zestjax.apps.results import write_record
 from zestjax.apps.scenes import place_of
 from zestjax.apps.train import run_name
 from zestjax.apps.weights import shipped_weights
 from zestjax.base.checks import check_option
-from zestjax.io.files import resolved, write_bytes
+from zestjax.io.files import resolved
 from zestjax.io.reading import read_json
 from zestjax.io.scenes import PROTOCOLS, scenes_in
 from zestjax.simulate.bench import BENCH
@@ -252,7 +253,7 @@ def _started(given, plan):
 
 
 def _store(out, plan):
-    write_bytes(out / PLAN, (json.dumps({"digest": plan.digest, "plan": plan.stored}, indent=1) + "\n").encode())
+    write_record(out / PLAN, {"digest": plan.digest, "plan": plan.stored})
     return plan
 
 

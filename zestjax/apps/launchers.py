@@ -15,7 +15,8 @@ import time
 from importlib import import_module
 
 from zestjax.apps.fold_run import run_fold, stopped_by_signals
-from zestjax.apps.fold_state import Place, locked, read_record, state_of
+from zestjax.apps.fold_state import Place, locked, state_of
+from zestjax.apps.results import read_record
 from zestjax.apps.run_folder import threads
 from zestjax.io.files import resolved, write_bytes
 

@@ -24,7 +24,7 @@ def begin(record, names, told):
     Raises:
       OSError: the place is not writable.
     """
-    for name in names(_read(record)):
+    for name in names(read_record(record)):
         if isinstance(name, str) and OURS.fullmatch(name):
             (record.parent / name).unlink(missing_ok=True)
     write_record(record, told)
@@ -35,8 +35,8 @@ def write_record(record, told):
     write_bytes(record, (json.dumps(told, indent=1) + "\n").encode())
 
 
-def _read(record):
-    """An earlier record; empty where there is none that can be read."""
+def read_record(record):
+    """The dict of a record; empty where there is none that can be read."""
     try:
         told = read_json(record)
     except (OSError, ValueError):

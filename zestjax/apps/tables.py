@@ -1,8 +1,8 @@
 """metrics.json as a line and as a table for people."""
 
-import json
 from pathlib import Path
 
+from zestjax.apps.results import write_record
 from zestjax.apps.scoring import REGIONS, better_floor, mean_scores, share_of_the_way
 from zestjax.io.files import write_bytes
 
@@ -52,7 +52,7 @@ def write_table(out, reports):
     whole = {"scene": "mean", **shared, **means, "targets": [_placed(t, r) for r in reports for t in r["targets"]]}
     table = [HEAD, "|---" * HEAD.count(" | ") + "|---|", *(table_row(report) for report in [*reports, whole])]
     write_bytes(Path(out) / "table.md", ("\n".join(table) + "\n").encode())
-    write_bytes(Path(out) / "metrics.json", (json.dumps(whole, indent=1) + "\n").encode())
+    write_record(Path(out) / "metrics.json", whole)
     return whole
 
 

@@ -3,7 +3,7 @@
 patch    (side, side, 3) colours of a step's rays, true or rendered
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -21,13 +21,13 @@ from zestjax.losses.adversarial import (
 )
 from zestjax.losses.regularisers import edge_aware_depth_loss
 from zestjax.solve import Adam
+from zestjax.systems.fields import MOST_WIDTH
 from zestjax.systems.system import Params, System
 from zestjax.train.learn import SHOWN, training_objective
 from zestjax.train.players import Player
 from zestjax.train.rays import Patch
 
 ADV = "adv"  # the term in which the renderer meets the discriminator
-MOST_WIDTH = 4096  # of a network that fits a machine: a file may not ask for more
 
 
 class Opponents(NamedTuple):
@@ -93,7 +93,14 @@ def patch_measures(side: int) -> dict[str, Callable]:
 
 
 def opponents_of(
-    system: System, adversary: Adversary, solver: Any, *, weights: Callable, side: int, blocks: int
+    system: System,
+    adversary: Adversary,
+    solver: Any,
+    *,
+    weights: Callable,
+    rays: Patch,
+    own: Mapping[str, Callable],
+    blocks: int,
 ) -> tuple[Player, Player]:
     """The renderer and the discriminator as players over `Opponents`.
 
@@ -102,7 +109,8 @@ def opponents_of(
       adversary: `Adversary`.
       solver: the renderer's.
       weights: of a step, `adv` among them.
-      side: of the patch.
+      rays: the patch.
+      own: measures of the patch, by term.
       blocks: see `learn.training_objective`.
 
     Returns:
@@ -115,8 +123,8 @@ def opponents_of(
     declared = weights(0)
 
     def renderer(tree, batch, said, step):
-        own = patch_measures(side) | {ADV: lambda p, t: generator_loss(verdict(tree, p.colour))}
-        objective = training_objective(system, weights=declared, blocks=blocks, own=own, whole=True)
+        measures = {**own, ADV: lambda p, t: generator_loss(verdict(tree, p.colour))}
+        objective = training_objective(system, weights=declared, blocks=blocks, own=measures, whole=True)
         return objective(tree.model, batch, weights(step))
 
     def judge(tree, batch, said, step):
@@ -126,7 +134,7 @@ def opponents_of(
         return discriminator_loss(real, rendered), jax.lax.stop_gradient(terms)
 
     def verdict(tree, colour):
-        patch = patch_of(jnp.asarray(colour).astype(jnp.float32), side)
+        patch = patch_of(jnp.asarray(colour).astype(jnp.float32), rays.side)
         return adversary.scores(tree.discriminator, patch[None])
 
     return Player("model", renderer, solver), Player("discriminator", judge, Adam(learning_rate=adversary.rate))

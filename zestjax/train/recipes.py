@@ -131,8 +131,8 @@ class Recipe:
         """The players of a run of so many steps, where there is an adversary."""
         assert self.adversary is not None and isinstance(self.rays, Patch)
         return opponents_of(
-            self.system, self.adversary, self._solver(steps), weights=self.weights, side=self.rays.side,
-            blocks=self.blocks,
+            self.system, self.adversary, self._solver(steps), weights=self.weights, rays=self.rays,
+            own=self.own, blocks=self.blocks,
         )  # fmt: skip
 
     def _solver(self, steps: int) -> Adam:
