@@ -190,7 +190,7 @@ def heads(features, weights, hidden, colour, visible):
     head = jax.tree.map(lambda x: x.astype(features.dtype), fields()[0].head.views)
     lift = lifted(head, features)
     scores = view_scores(head, lift, hidden)
-    return pooled_views(lift, weights), scores, blend_of_views(scores, weights, visible, colour)
+    return pooled_views(lift, weights).T, scores, blend_of_views(scores, weights, visible, colour).T
 
 
 def heads_by_loop(features, weights, hidden, colour, visible):

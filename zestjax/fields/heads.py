@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.numerics import computed_once
 from zestjax.base.parts import part
 from zestjax.fields.conditioning import ViewSamples
 from zestjax.fields.trunk import (
@@ -89,11 +90,11 @@ class Blend:
     def __call__(self, params, volume, samples, views):
         """See `Head`."""
         lift = lifted(params.views, views.features)
-        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
+        condition = jnp.concatenate([volume, computed_once(pooled_views, lift, views.weights).T, views.summary], -1)
 
         def colour(state, direction):
-            scores = view_scores(params.views, lift, state)
-            shown = blend_of_views(scores, views.weights, samples.visible, samples.colour)
+            scores = computed_once(view_scores, params.views, lift, state)
+            shown = computed_once(blend_of_views, scores, views.weights, samples.visible, samples.colour).T
             residual = direct_colour(params.colour, state, direction) - 0.5
             return jnp.clip(shown + RESIDUAL * residual, 0, 1)
 
