@@ -29,10 +29,12 @@ RESIDUAL = 0.1  # how far a colour may leave what the views show: highlights, no
 
 
 class ViewFeatures(NamedTuple):
-    """Views at points. features: (V, U, P) of each. weights: (V, P) how far it counts. summary: (P, F) of them all."""
+    """Views at points. features: (V, U, P) of each. weights: (V, P) how far it counts, and prior: (V, P) how far its
+    colour does. summary: (P, F) of them all."""
 
     features: jax.Array
     weights: jax.Array
+    prior: jax.Array
     summary: jax.Array
 
 
@@ -94,7 +96,7 @@ class Blend:
 
         def colour(state, direction):
             scores = computed_once(view_scores, params.views, lift, state)
-            shown = computed_once(blend_of_views, scores, views.weights, samples.visible, samples.colour).T
+            shown = computed_once(blend_of_views, scores, views.prior, samples.visible, samples.colour).T
             residual = direct_colour(params.colour, state, direction) - 0.5
             return jnp.clip(shown + RESIDUAL * residual, 0, 1)
 

@@ -184,7 +184,8 @@ class Dynamic(Choices):
             step = jnp.where(times > 0, early[None, :, :3], early[None, :, 3:]) * jnp.abs(times)
             # Where to look is learned from the flow's own losses: no gradient through the gathers.
             samples = computed_once(sample_views, seen.views, jax.lax.stop_gradient(place.world(coords[None] + step)))
-            views = computed_once(dynamic_views, samples, seen.views.times)
+            shift = parallax(seen.views.cameras, flat(marched.points)[None], flat(marched.beyond)[None])
+            views = computed_once(dynamic_views, samples, shift, seen.views.times)
         elif seen.views is not None:
             samples = computed_once(sample_views, seen.views, place.world(coords)[None])
         reading, direction = self.head(net.head, volume, samples, views), directions_of(self, marched)
