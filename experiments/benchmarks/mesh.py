@@ -69,6 +69,8 @@ def spawned(count):
     finally:
         for process in running:
             process.kill()
+    if failed := [process.returncode for process in running if process.returncode]:
+        raise SystemExit(f"mesh: {len(failed)} of {count} processes failed; their last lines say why.")
 
 
 def main():

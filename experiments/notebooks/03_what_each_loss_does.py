@@ -1,7 +1,7 @@
 # %% [markdown]
 # # What each loss term does to a scene
 #
-# The same small model learns the same clip seven times: once with all of its losses, and once without each of six.
+# The same small model learns the same clip five times: once with all of its losses, and once without each of four.
 # What is missing afterwards is what the term was for. All runs share one compiled step, because weights may be
 # arguments: a weight that is an array, even one holding 0, is computed. (A Python 0 leaves a term out of the program
 # instead. That is what you want in a real run, and it costs a compile for each choice.)
@@ -58,8 +58,6 @@ def learned(without=None, steps=400):
 start = time.perf_counter()
 ABOUT = {
     None: "all losses",
-    "static_rec": "the static field alone must show the scene without what moves",
-    "dynamic_rec": "what moves must look right",
     "mask": "the dynamic field's share of a pixel must be the motion mask",
     "depth_ce": "the volumes' surfaces must lie at the true depths",
     "frame_ce": "each frame's own depths must be right, since they decide whom to trust",
