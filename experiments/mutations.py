@@ -98,9 +98,10 @@ MUTATIONS = {
     "fields/conditioning": [
         ("jnp.where(seen, values[:, 5], 1)", "values[:, 5]"),
         ("1 / jnp.where(seen, depth, 1)", "1 / depth"),
-        ("jnp.where(both[..., None], here.pixels - beyond.pixels, 100.0)", "(here.pixels - beyond.pixels)"),
+        ("jnp.where(front & front_beyond, shift, 200.0)", "shift"),
+        ("1 / jnp.where(front, depth, 1)", "1 / depth"),
     ],
-    "fields/trunk": [("(mean / jnp.maximum(total, 1e-9)[None])", "(mean / total[None])")],
+    "fields/trunk": [("mean / jnp.maximum(total, 1e-9)[None]", "mean / total[None]")],
 }  # fmt: skip
 """Module: (guard, what stands in its place)."""
 

@@ -160,3 +160,17 @@ def test_a_suite_is_stopped_by_name(monkeypatch):
     with pytest.raises(AssertionError, match="check_backend: mapped sum: relative error 1.0e[+]00; set XLA_FLAGS"):
         check_backend()
     assert [check.ok for check in backend_checks()] == [False, True, True]
+
+
+def test_a_program_compiled_quickly_computes_the_same():
+    points = jnp.asarray(np.random.default_rng(0).normal(size=(64, 3)), jnp.float32)
+    fn = lambda x: jnp.sum(jnp.sin(x) * jnp.exp(-x), axis=-1)
+    gradient = jax.grad(lambda x: fn(x).sum())
+    found, expected = jax.jit(gradient, compiler_options=backend.quick())(points), jax.jit(gradient)(points)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_compiler_options_are_for_cpus_alone(monkeypatch):
+    assert backend.quick() == {"xla_backend_optimization_level": 0}
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert backend.quick() == {}

@@ -105,6 +105,7 @@ def test_evaluate_writes_the_scores_and_a_picture_of_every_target(places, grey, 
     report = json.loads((places / "out/evaluate/metrics.json").read_text())
     assert report["scene"] == "toy" and report["system"] == "zest" and report["protocol"] == "held-out"
     assert (report["height"], report["width"], report["preset"]) == (HEIGHT, WIDTH, "tiny")
+    assert report["floors"].pop("flow_interpolation") is None  # the frames of the targets' times are there
     for scores in (report["mean"], *report["floors"].values(), *report["targets"]):
         assert all(set(scores[region]) == {"psnr", "ssim", "lpips"} for region in ("full", "dynamic", "static"))
     assert set(report["floors"]) == {"nearest_frame", "plane_warp"} and report["ceiling"] is None

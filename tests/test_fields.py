@@ -190,7 +190,7 @@ def heads(features, weights, hidden, colour, visible):
     head = jax.tree.map(lambda x: x.astype(features.dtype), fields()[0].head.views)
     lift = lifted(head, features)
     scores = view_scores(head, lift, hidden)
-    return pooled_views(lift, weights), scores, blend_of_views(scores, weights, visible, colour)
+    return pooled_views(lift, weights).T, scores, blend_of_views(scores, weights, visible, colour).T
 
 
 def heads_by_loop(features, weights, hidden, colour, visible):
@@ -261,7 +261,7 @@ def both(colour, visible, moving, gap, volume):
     shift, times = uniform(7, V, P, dtype=dtype), jnp.arange(V, dtype=dtype) - 1
     early = dynamic.early_flow(moved, point, volume, reach=0.15)
     of_still = BLEND(still.head, volume, samples, static.static_views(samples, shift, times))
-    of_moved = BLEND(moved.head, volume, samples, dynamic.dynamic_views(samples, times))
+    of_moved = BLEND(moved.head, volume, samples, dynamic.dynamic_views(samples, shift, times))
     return (
         static.static_field(still, point, direction, of_still),
         dynamic.dynamic_field(moved, point, direction, of_moved, reach=0.15, early=early),
@@ -320,7 +320,7 @@ def coloured():
     return jnp.broadcast_to(jnp.eye(3)[:, :, None], (V, 3, P))
 
 
-def shown_by(field, moving, gap):
+def shown_by(field, moving, gap, parallax=9.0):
     """(P, 3) colours of a field of points at gaps (V,) behind surfaces that move or not, (V,)."""
     wide = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32)[:, None], (V, P))
     samples = ViewSamples(coloured(), jnp.ones((V, P)), wide(moving), wide(gap))
@@ -329,7 +329,7 @@ def shown_by(field, moving, gap):
     if field == 0:
         views = static.static_views(samples, jnp.zeros((V, P)), times)
         return static.static_field(params, point, point, BLEND(params.head, volume, samples, views)).colour
-    views = dynamic.dynamic_views(samples, times)
+    views = dynamic.dynamic_views(samples, jnp.full((V, P), parallax), times)
     return dynamic.dynamic_field(params, point, point, BLEND(params.head, volume, samples, views)).colour
 
 
@@ -347,6 +347,14 @@ def test_the_dynamic_field_takes_the_colour_of_what_moves_where_the_point_is():
     colour = shown_by(1, [0, 1, 1], [0.0, 0.0, 3.0])
     assert (colour[:, 1] > 0.9).all() and (colour[:, 2] < 1e-3).all()
     assert (colour[:, 1] > 10 * colour[:, 0]).all()
+
+
+def test_from_the_targets_own_time_and_place_the_colour_is_what_is_seen_there():
+    """View 0 is of the target's time. Whatever it says of motion and depth, from the same place it shows the answer."""
+    colour = shown_by(1, [0, 1, 1], [0.0, 0.0, 3.0], parallax=0.0)
+    elsewhere = shown_by(1, [0, 1, 1], [0.0, 0.0, 3.0], parallax=4.0)
+    assert (colour[:, 0] > 0.3).all() and (colour[:, 0] > 10 * elsewhere[:, 0]).all()
+    np.testing.assert_allclose(shown_by(1, [1, 1, 1], [0.0, 0.0, 0.0], parallax=0.0)[:, 0], 1, atol=0.1)
 
 
 def test_without_views_or_volume_a_field_is_conditioned_on_a_constant():

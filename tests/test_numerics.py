@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles import assert_finite, assert_grads_match
+from oracles import assert_finite, assert_grads_match, normal
 
 from zestjax.base import numerics
 
@@ -59,3 +59,43 @@ def test_gradients_match_finite_differences(x64):
     x = jnp.asarray(np.random.default_rng(0).normal(size=(2, 5)))
     assert_grads_match(lambda x: numerics.safe_norm(x) + numerics.exclusive_cumprod(x)[..., -1], x)
     assert_grads_match(lambda x: numerics.masked_mean(x, x > 0) + numerics.exclusive_cumsum(x).sum(), x)
+
+
+def sums(table, at):
+    """What a reader would be tempted to compute twice: rows gathered, and a weighted sum of them."""
+    rows = table[at]
+    return {"mean": rows.mean(-1), "rows": rows * 2.0, "count": at + 1}
+
+
+def test_what_is_computed_once_is_the_same_in_value_and_gradient():
+    table, at = normal(0, 7, 3), jnp.array([0, 3, 3, 6])
+    once = lambda *args: numerics.computed_once(sums, *args)
+    mapped = lambda fn: jax.vmap(fn, in_axes=(0, None))
+    for wrap, x in ((lambda fn: fn, table), (jax.jit, table), (mapped, jnp.stack([table, -table]))):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), wrap(once)(x, at), wrap(sums)(x, at))
+    slope = jax.grad(lambda t: jnp.sum(jnp.sin(numerics.computed_once(sums, t, at)["mean"])))(table)
+    np.testing.assert_allclose(slope, jax.grad(lambda t: jnp.sum(jnp.sin(sums(t, at)["mean"])))(table), rtol=1e-6)
+
+
+def test_its_gradient_is_its_slope():
+    loss = lambda t: jnp.sum(jnp.cos(numerics.computed_once(sums, t, jnp.array([1, 4]))["rows"]))
+    assert_grads_match(loss, normal(1, 5, 2))
+
+
+@pytest.mark.parametrize("odd", [0.0, -1.0, np.inf, -np.inf, np.nan, 3e38, 1e-45])
+def test_whatever_the_first_number_is_nothing_is_lost(odd):
+    x = normal(2, 6).at[0].set(odd)
+    found = jax.jit(lambda x: numerics.computed_once(lambda x: x + 1, x))(x)
+    np.testing.assert_array_equal(found, x + 1)
+
+
+def test_without_a_number_to_ask_it_is_the_function_itself():
+    np.testing.assert_array_equal(numerics.computed_once(lambda x: x + 1, jnp.arange(3)), [1, 2, 3])
+    empty = jnp.zeros((0, 3))
+    assert numerics.computed_once(lambda x: x + 1, empty).shape == (0, 3)
+
+
+def test_the_compiler_leaves_it_alone():
+    """Its program keeps the branch, on a CPU; elsewhere there is none to keep."""
+    text = jax.jit(lambda x: numerics.computed_once(jnp.sin, x) * 2.0).lower(normal(0, 9)).compile().as_text()
+    assert ("conditional(" in text) == (jax.default_backend() == "cpu")

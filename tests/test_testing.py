@@ -74,10 +74,27 @@ def test_what_stops_gradients_is_held(fn):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), held(fn, x)(x), fn(x))
 
 
-def test_a_stop_inside_a_condition_says_so():
-    fn = lambda x: jax.lax.cond(x[0] > 0, stopped, jnp.sum, x)
-    with pytest.raises(NotImplementedError, match="a stop_gradient inside `cond`"):
-        assert_grads_match(fn, uniform(0, 3))
+def branched(x):
+    """A stop in the branch that is taken: of the square where x is positive."""
+    stopped = lambda x: jax.lax.stop_gradient(jnp.sin(x)) * x
+    return jnp.sum(jax.lax.cond(x[0] > 0, stopped, jnp.square, x))
+
+
+def test_a_stop_in_a_branch_is_held_and_so_is_the_branch():
+    x = jnp.asarray([0.3, 2.0])
+    fixed = held(branched, x)
+    np.testing.assert_allclose(fixed(x), branched(x), rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(fixed)(x - 1.0), jnp.sum(jnp.sin(x) * (x - 1.0)), rtol=1e-6)
+    assert_grads_match(branched, x)
+    with pytest.raises(NotImplementedError, match="which branch a `cond` takes is not known"):
+        jax.jit(lambda x: held(branched, x)(x))(x)
+
+
+def test_a_stop_inside_a_loop_says_so():
+    step = lambda state: (state[0] + 1, state[1] * jax.lax.stop_gradient(state[1]))
+    loop = lambda x: jnp.sum(jax.lax.while_loop(lambda state: state[0] < 3, step, (0, x))[1])
+    with pytest.raises(NotImplementedError, match="a stop_gradient inside `while`"):
+        held(loop, jnp.ones(2))
 
 
 def test_walking_a_program_gives_its_result():

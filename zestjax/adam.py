@@ -5,13 +5,14 @@ grads    tree like the params
 moments  trees like the params in at least float32
 """
 
-from typing import NamedTuple
+import itertools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from zestjax.base.numerics import safe_sqrt
+from zestjax.base.numerics import computed_once, safe_sqrt
 from zestjax.base.trees import all_finite, tree_cast, tree_norm
 from zestjax.base.types import Array, Scalar, Tree
 
@@ -112,13 +113,14 @@ def adam(
       (params, state).
     """
     params, grads = _arrays(params), _arrays(grads)
-    finite = all_finite(grads)
-    norm = jnp.where(finite, tree_norm(tree_cast(grads, state.error.dtype)), jnp.inf)
+    vectors, restored = _vectors(params, grads, state.mean, state.square)
+    finite = all_finite([g for _, g, _, _ in vectors])
+    norm = jnp.where(finite, tree_norm(tree_cast([g for _, g, _, _ in vectors], state.error.dtype)), jnp.inf)
     good = finite & jnp.isfinite(value) if skip else jnp.bool_(True)
     scale = 1.0 if clip_norm is None else clip_norm / jnp.maximum(norm, clip_norm)
     count = state.iter_num - state.skipped + 1
 
-    def leaf(p, g, m, v):
+    def stepped(p, g, m, v):
         cast = lambda x: jnp.asarray(x).astype(m.dtype)
         g = cast(g) * cast(scale)
         mean, square = b1 * m + (1 - b1) * g, b2 * v + (1 - b2) * g**2
@@ -127,7 +129,31 @@ def adam(
         keep = lambda new, old: jnp.where(good, new, old)
         return keep((cast(p) - change).astype(p.dtype), p), keep(mean, m), keep(square, v)
 
-    stepped = jax.tree.map(leaf, params, grads, state.mean, state.square)
-    params, mean, square = jax.tree.transpose(jax.tree.structure(params), jax.tree.structure((0, 0, 0)), stepped)
+    params, mean, square = restored([computed_once(stepped, *four) for four in vectors])
     left_out = jnp.where(good, 0, 1).astype(state.skipped.dtype)
     return params, AdamState(state.iter_num + 1, state.skipped + left_out, jnp.asarray(value), norm, mean, square, aux)
+
+
+def _vectors(*trees):
+    """([for each type of leaves a vector of every tree], what makes a tuple of trees of such lists again).
+
+    Compiled leaf by leaf, an update of 140 leaves takes 17 s to compile.
+    """
+    leaves = list(zip(*map(jax.tree.leaves, trees), strict=True))
+    kinds: dict[Any, list[int]] = {}
+    for i, leaf in enumerate(leaves):
+        kinds.setdefault(tuple(x.dtype for x in leaf), []).append(i)
+    joined = lambda *arrays: jnp.concatenate([jnp.ravel(x) for x in arrays])
+    vectors = [
+        [computed_once(joined, *(leaves[i][k] for i in places)) for k in range(len(trees))] for places in kinds.values()
+    ]
+
+    def restored(found):
+        parts: list[Any] = [None] * len(leaves)
+        for places, results in zip(kinds.values(), found, strict=True):
+            ends = list(itertools.accumulate(leaves[i][0].size for i in places))[:-1]
+            for i, part in zip(places, zip(*(jnp.split(x, ends) for x in results), strict=True), strict=True):
+                parts[i] = tuple(x.reshape(leaves[i][0].shape) for x in part)
+        return tuple(jax.tree.unflatten(jax.tree.structure(trees[0]), column) for column in zip(*parts, strict=True))
+
+    return vectors, restored

@@ -19,6 +19,7 @@ from zestjax.base.types import Array
 from zestjax.cameras import Camera, project
 from zestjax.frames.analysis import FrameMaps
 from zestjax.frames.assembly import Footage, dequantised, footage, video_evidence
+from zestjax.frames.between import with_stand_in
 from zestjax.frames.inputs import check_exclude, check_inputs, check_view
 from zestjax.rays import pixel_grid
 from zestjax.systems.system import Params, System
@@ -137,7 +138,9 @@ def render_view(
       camera: `Camera` for an image of the video's size.
       time: int frame time.
       system: `System`.
-      exclude: see the header; their traces in the other frames' maps are removed too.
+      exclude: see the header; their traces in the other frames' maps are removed too. Where the frame of the target's
+        own time is among them, and neither time nor video is traced, one made of its neighbours by optical flow
+        (`frames.between`) takes its slot.
 
     Returns:
       `View`.
@@ -153,6 +156,10 @@ def render_view(
     if maps is None and system.frames is not None:
         raise ValueError(f"{where}: `prepared` has no maps of its frames; prepare the video with the same `system`.")
     time, exclude = check_view(where, video, camera, time, exclude=exclude)
+    between = _stand_in(prepared, time, exclude, system)
+    if between is not None:
+        inputs, maps = _inputs_with(between, params, prepared, camera, time, system=system, exclude=exclude)
+        return render_inputs(params, inputs, maps, system=system)
     inputs, frames = target_inputs(
         video.images, video.cameras, video.near, video.far, camera, time, system=system, exclude=exclude
     )
@@ -167,6 +174,28 @@ def render_view(
     else:
         maps = jax.tree.map(lambda x: x[frames], maps)
     return render_inputs(params, inputs, maps, system=system)
+
+
+def _stand_in(prepared, time, exclude, system):
+    """(`Video`, `Footage`) where the frame of the target's time may not be read, and is made of its neighbours; None
+    where it may, where nothing is known of it, or nobody asks for it."""
+    if traced((prepared, time)) or time not in exclude or system.frames is None or system.dynamic is None:
+        return None
+    if 0 not in getattr(system.dynamic.frames, "offsets", ()):
+        return None
+    return with_stand_in(prepared.video, prepared.footage, time, exclude=exclude)
+
+
+def _inputs_with(between, params, prepared, camera, time, *, system, exclude):
+    """`Inputs` and `FrameMaps` of a target whose own frame is stood in for: among the slots and in their maps."""
+    video, seen = between
+    inputs, frames = target_inputs(
+        video.images, video.cameras, video.near, video.far, camera, time, system=system, exclude=exclude, stand_in=True
+    )
+    count, missing = len(inputs.key.valid), tuple(i for i in exclude if i != time)
+    of_key = _frame_maps(params, prepared.footage, prepared.video, system, frames=frames[:count], exclude=exclude)
+    of_slots = _frame_maps(params, seen, video, system, frames=frames[count:], exclude=missing)
+    return inputs, jax.tree.map(lambda *parts: jnp.concatenate(parts), of_key, of_slots)
 
 
 @functools.partial(jax.jit, static_argnames=("system", "rows"))

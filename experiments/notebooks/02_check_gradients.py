@@ -22,7 +22,7 @@ from zestjax.simulate.clips import training_clip
 from zestjax.systems.fields import Dynamic, Static
 from zestjax.systems.swept import Swept
 from zestjax.systems.system import Space, System
-from zestjax.testing import assert_grads_match, explain_gradient, held
+from zestjax.testing import assert_grads_match, explain_gradient, held, quick
 from zestjax.train.batches import batch_from_clip, prepare_clip
 from zestjax.train.learn import training_objective
 from zestjax.train.rays import Rows
@@ -42,7 +42,8 @@ params = system.init(jax.random.key(1))
 #
 # Start with one function: the weights of samples along a ray. A central difference errs by the square of the step,
 # and by the rounding of the function divided by the step. The first shrinks with the step, the second grows, and
-# between them lies a valley whose floor is as deep as the precision allows.
+# between them lies a valley whose floor is as deep as the precision allows. (`quick()` are compiler options: these
+# programs run a few times, and compiling them is most of the wait.)
 
 # %%
 STEPS = np.logspace(-9, -0.5, 35)
@@ -50,13 +51,13 @@ STEPS = np.logspace(-9, -0.5, 35)
 
 def slope(fn, x, way):
     """The slope of `fn` at `x` along `way`, by its gradient."""
-    grads = jax.jit(jax.grad(fn))(x)
+    grads = jax.jit(jax.grad(fn), compiler_options=quick())(x)
     return float(sum(jnp.vdot(a, b) for a, b in zip(jax.tree.leaves(grads), jax.tree.leaves(way), strict=True)))
 
 
 def differences(fn, x, way):
     """The same by central differences, at every step."""
-    along = jax.jit(lambda t: fn(jax.tree.map(lambda a, b: a + t * b, x, way)))
+    along = jax.jit(lambda t: fn(jax.tree.map(lambda a, b: a + t * b, x, way)), compiler_options=quick())
     like = lambda t: jnp.asarray(t, jax.tree.leaves(x)[0].dtype)
     return np.array([(along(like(h)) - along(like(-h))) / (2 * h) for h in STEPS], np.float64)
 
@@ -154,7 +155,7 @@ print(explain_gradient(flow_lengths, jnp.zeros((4, 3))))
 gradients = []
 for blocks in (1, 4):
     taught = training_objective(system, weights=dict(rec=1.0, b=1e-2), blocks=blocks)
-    (value, terms), found = jax.jit(jax.value_and_grad(taught, has_aux=True))(params, batch)
+    (value, terms), found = jax.jit(jax.value_and_grad(taught, has_aux=True), compiler_options=quick())(params, batch)
     gradients.append(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(found)]))
     print(blocks, "blocks:", {name: round(float(x), 4) for name, x in terms.items()}, "total", round(float(value), 4))
 whole, blocked = gradients

@@ -46,7 +46,7 @@ solver = Adam(fun=TINY.objective(), has_aux=True, learning_rate=3e-3, clip_norm=
 update = jax.jit(solver.update)
 
 
-def learned(without=None, steps=400):
+def learned(without=None, steps=120):
     weights = {name: jnp.float32(0 if name == without else weight) for name, weight in TINY.weights(0).items()}
     params = system.init(jax.random.key(1))
     state = solver.init_state(params, batches[0], weights)
@@ -128,4 +128,4 @@ figure.tight_layout(pad=0.3)
 #   On one clip the colours alone tell the model most of it; what these terms are for shows on scenes that it has not
 #   seen.
 #
-# A clip of 32 x 48 pixels and 400 steps are a sketch; the ablation of the whole system is in `experiments/study.py`.
+# A clip of 32 x 48 pixels and 120 steps are a sketch; the ablation of the whole system is in `experiments/study.py`.

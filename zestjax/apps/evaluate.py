@@ -18,8 +18,9 @@ from zestjax.apps import results
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
-from zestjax.apps.tables import counted, headline, lacking, write_table
+from zestjax.apps.tables import FLOORS, counted, headline, lacking, write_table
 from zestjax.apps.weights import arithmetic, at_precision, open_weights, standing_still
+from zestjax.frames.between import flow_interpolation
 from zestjax.io.figures import depth_picture, error_picture, share_picture, side_by_side
 from zestjax.io.lpips import load_lpips
 from zestjax.io.pictures import write_image
@@ -176,7 +177,11 @@ def evaluate_target(view_of, scene, target, ceiling, out, lpips=None):
         "seconds": number(seconds), "file": name if out is not None else None,
     }  # fmt: skip
     extra = None if limit is None else score(limit.image) | {"unseen": number(limit.unseen)}
-    return {"row": row, "nearest_frame": score(nearest), "plane_warp": score(warped), "ceiling": extra}
+    between = interpolated(view_of.video, target, nearest)
+    return {
+        "row": row, "nearest_frame": score(nearest), "plane_warp": score(warped),
+        "flow_interpolation": None if between is None else score(between), "ceiling": extra,
+    }  # fmt: skip
 
 
 def summary(rows):
@@ -186,7 +191,7 @@ def summary(rows):
     mean["seconds_per_frame"] = mean.pop("seconds")
     return {
         "mean": mean,
-        "floors": {name: mean_scores([r[name] for r in rows]) for name in ("nearest_frame", "plane_warp")},
+        "floors": {name: mean_scores([r[name] for r in rows]) for name in FLOORS},
         "ceiling": mean_scores([r["ceiling"] for r in rows]),
     }
 
@@ -202,6 +207,15 @@ def floor_images(video, target):
     exclude = jnp.asarray(target.exclude, jnp.int32).reshape(-1)
     camera = jax.tree.map(jnp.asarray, target.camera)
     return tuple(np.asarray(image) for image in _floors(video, camera, jnp.int32(target.time), exclude))
+
+
+def interpolated(video, target, nearest):
+    """The third floor, (H, W, 3), of a target whose own frame is taken away; at the ends of the video, where there is
+    no frame on one side, the nearest frame. None of other targets: the video was not there."""
+    if target.time not in target.exclude:
+        return None
+    found = flow_interpolation(video.images, target.time, exclude=target.exclude)
+    return nearest if found is None else found.image
 
 
 def picture_of(nearest, view, target, video):

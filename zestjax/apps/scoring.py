@@ -99,7 +99,7 @@ def mean_scores(rows):
 
 
 def better_floor(floors, region="full"):
-    """The higher PSNR of the two floors in a region, or None."""
+    """The highest PSNR of the floors in a region, or None."""
     known = [floor[region]["psnr"] for floor in floors.values() if floor and floor.get(region)]
     return max(known) if known else None
 

@@ -6,10 +6,10 @@ from zestjax.apps.results import write_record
 from zestjax.apps.scoring import REGIONS, better_floor, mean_scores, share_of_the_way
 from zestjax.io.files import write_bytes
 
-HEAD = (
-    "| scene | full PSNR / SSIM / LPIPS | dynamic | static | nearest | plane warp | ceiling | above the better floor "
-    "(full / dynamic / static) | of the way | depth | flow px | s / frame |"
-)
+SCORES = ("scene", "full PSNR / SSIM / LPIPS", "dynamic", "static")
+FLOORS = {"nearest_frame": "nearest", "plane_warp": "plane warp", "flow_interpolation": "flow interpolation"}
+"""Columns of floors; the last is there where the protocol has it."""
+REST = ("ceiling", "above the best floor (full / dynamic / static)", "of the way", "depth", "flow px", "s / frame")
 
 
 NEEDS = {
@@ -50,7 +50,10 @@ def write_table(out, reports):
     shared = {key: reports[0][key] for key in ("system", "protocol", "height", "width", "preset", "device", "weights")}
     means = {key: mean_scores([report[key] for report in reports]) for key in ("mean", "floors", "ceiling")}
     whole = {"scene": "mean", **shared, **means, "targets": [_placed(t, r) for r in reports for t in r["targets"]]}
-    table = [HEAD, "|---" * HEAD.count(" | ") + "|---|", *(table_row(report) for report in [*reports, whole])]
+    shown = [floor for floor in FLOORS if whole["floors"].get(floor)]
+    head = (*SCORES, *(FLOORS[floor] for floor in shown), *REST)
+    rows = [table_row(report, shown) for report in [*reports, whole]]
+    table = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *rows]
     write_bytes(Path(out) / "table.md", ("\n".join(table) + "\n").encode())
     write_record(Path(out) / "metrics.json", whole)
     return whole
@@ -62,8 +65,8 @@ def _placed(target, report):
     return {"scene": report["scene"], **target, "file": file}
 
 
-def table_row(report):
-    """A scene's row."""
+def table_row(report, shown):
+    """A scene's row, with these floors."""
     mean, floors, ceiling = report["mean"], report["floors"], report["ceiling"]
     psnrs = lambda scores: " / ".join(_shown(scores[r]["psnr"] if scores and scores.get(r) else None) for r in REGIONS)
     gains = []
@@ -77,7 +80,7 @@ def table_row(report):
     ]
     share = share_of_the_way(mean, floors, ceiling)
     cells = [
-        report["scene"], *pairs, psnrs(floors["nearest_frame"]), psnrs(floors["plane_warp"]), psnrs(ceiling),
+        report["scene"], *pairs, *(psnrs(floors.get(floor)) for floor in shown), psnrs(ceiling),
         " / ".join(gains), "–" if share is None else f"{100 * share:.0f} %", _shown(mean["depth_abs_rel"], 3),
         _shown(mean["flow_epe_px"]), _shown(mean["seconds_per_frame"]),
     ]  # fmt: skip

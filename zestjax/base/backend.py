@@ -4,6 +4,7 @@ YNN      kernels to which XLA hands whole products and sums on a CPU. In jaxlib 
          comes out wrong from 32,769 rows on (jax-ml/jax#39103); in every version sums by them are 50 to 100 times
          less exact than XLA's own, and our programs are slower
 flag     `XLA_FLAGS` is read once, when JAX first needs a device; what is written there later changes nothing
+option   one of a single program's, which `jax.jit(..., compiler_options=...)` takes at any time
 """
 
 import importlib.metadata
@@ -55,6 +56,22 @@ def decide() -> Decision:
         return Decision("unknown", flags)
     os.environ["XLA_FLAGS"] = f"{flags} {FLAG}=".lstrip()
     return Decision("off", os.environ["XLA_FLAGS"])
+
+
+def quick() -> dict[str, int]:
+    """Compiler options for a program that runs a few times, as a gradient that is checked: `jax.jit(f,
+    compiler_options=quick())`.
+
+    The gradient of a whole system's objective compiles in 60 % of the time and takes two to four times as long to run
+    (README, "Compiling"); values differ by roundings. JAX takes options where a program is compiled, not in a function
+    that another `jit` or `grad` traces. Empty where the default device is no CPU.
+
+    XLA's older way to generate code (`xla_cpu_use_fusion_emitters` off, jaxlib 0.10) would halve the time again, and is
+    not among the options: at this level it computes a product of joined arrays wrongly.
+    """
+    import jax
+
+    return {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else {}
 
 
 def sum_error(*, rows: int = LEAST_ROWS, seed: int = 0) -> float:

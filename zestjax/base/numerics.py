@@ -5,12 +5,13 @@ Each is named for what it guarantees; the test beside it goes to the point where
 
 import functools
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from zestjax.base.types import Array, Scalar
+from zestjax.base.types import Array, Scalar, T
 
 HIGHEST = jax.lax.Precision.HIGHEST  # on GPUs and TPUs the default rounds to the digits of a half: pixels off
 
@@ -88,3 +89,24 @@ def matvec(matrix: Array, vector: Array) -> jax.Array:
 def matmul(a: Array, b: Array) -> jax.Array:
     """(..., i, j) x (..., j, k) -> (..., i, k) in true float32, on GPUs and TPUs too."""
     return jnp.matmul(a, b, precision=HIGHEST)
+
+
+def computed_once(fn: Callable[..., T], *args: Any) -> T:
+    """`fn(*args)`, kept, where XLA's CPU compiler would compute it again in everything that reads it.
+
+    The compiler takes gathers and sums of products for cheap, and repeats them in each of their readers, through a
+    `lax.optimization_barrier` too. No code leaves a branch, so this is the branch of a condition that always
+    holds, which it cannot know. Values and gradients are those of `fn`; on other devices this is `fn` itself.
+
+    Args:
+      fn: of arrays, to a tree of arrays.
+      *args: trees of arrays; one of them floating-point, or nothing is gained.
+    """
+    numbers = (x for x in jax.tree.leaves(args) if jnp.issubdtype(x.dtype, jnp.floating) and x.size)
+    number = next(numbers, None)
+    if number is None or jax.default_backend() != "cpu":
+        return fn(*args)
+    number = jax.lax.stop_gradient(jnp.ravel(number)[0])
+    always = (number < jnp.inf) | (number == jnp.inf) | jnp.isnan(number)
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(fn, *args))
+    return jax.lax.cond(always, fn, lambda *_: nothing, *args)

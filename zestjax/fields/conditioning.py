@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_shapes
-from zestjax.base.numerics import added, safe_divide
+from zestjax.base.numerics import added, matmul, safe_divide
 from zestjax.base.types import Array
-from zestjax.cameras import Camera, project
+from zestjax.cameras import NEAREST_DEPTH, Camera
 from zestjax.resample import bilinear_cells, corner_offsets, gather_corners, interpolate
 
 GAP_LIMIT = 3.0  # tolerances: beyond, exp(-gap^2) is below 1e-3, and a gap says no more
@@ -57,9 +57,8 @@ def sample_views(views: SourceViews, points: jax.Array) -> ViewSamples:
     """
     sizes = check_shapes("sample_views", tables=(views.tables, "V H W C"), points=(points, "one P 3"))
     count, height, width, channels = (sizes[a] for a in "VHWC")
-    cameras = jax.tree.map(lambda x: x[:, None], views.cameras)
-    pixels, depth, front = project(cameras, jnp.broadcast_to(points, (count, sizes["P"], 3)))
-    cells = bilinear_cells(pixels[..., 0], pixels[..., 1], height, width)
+    column, row, depth, front = _projected(views.cameras, points)
+    cells = bilinear_cells(column, row, height, width)
     seen = cells.inside & front & (views.valid[:, None] > 0)
     first = cells.first + (jnp.arange(count, dtype=jnp.int32) * (height * width))[:, None]
     corners = gather_corners(views.tables.reshape(-1, channels), first, corner_offsets(height, width))
@@ -100,9 +99,22 @@ def over_views(weights: jax.Array, values: jax.Array) -> jax.Array:
 
 def parallax(cameras: Camera, points: jax.Array, points_beyond: jax.Array) -> jax.Array:
     """(V, P) pixels by which the views see two points of each target ray apart: 0 from the target's own position."""
-    cameras = jax.tree.map(lambda x: x[:, None], cameras)
-    here, beyond = project(cameras, points), project(cameras, points_beyond)
-    both = here.in_front & beyond.in_front
+    columns, rows, _, front = _projected(cameras, points)
+    columns_beyond, rows_beyond, _, front_beyond = _projected(cameras, points_beyond)
+    shift = jnp.abs(columns - columns_beyond) + jnp.abs(rows - rows_beyond)
     # Behind a view: as far apart as two ends of an image, so that it counts as the farthest of views.
-    shift = jnp.where(both[..., None], here.pixels - beyond.pixels, 100.0)
-    return jnp.sum(jnp.abs(jax.lax.stop_gradient(shift)), axis=-1)
+    return jax.lax.stop_gradient(jnp.where(front & front_beyond, shift, 200.0))
+
+
+def _projected(cameras: Camera, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Column, row, depth and whether in front, (V, P) each, of points (V, P, 3) or (1, P, 3): `project`, axis by axis.
+
+    Products of so small matrices are slow as products, and three numbers a point do not fill a vector.
+    """
+    turned = matmul(cameras.intrinsics, cameras.camera_from_world[:, :3])[..., None]
+    x, y, z = (points[..., axis] for axis in range(3))
+    along = lambda r: turned[:, r, 0] * x + turned[:, r, 1] * y + turned[:, r, 2] * z + turned[:, r, 3]
+    depth = along(2)
+    front = depth > NEAREST_DEPTH
+    scale = 1 / jnp.where(front, depth, 1)
+    return along(0) * scale, along(1) * scale, depth, front

@@ -19,6 +19,9 @@ from zestjax.nets.layers import Dense, dense, init_dense, raised
 VIEW_FEATURES = 14  # three colours and the eleven scalars of `dynamic_views`
 SUMMARIES = 4  # and two more of every slot
 HEARSAY = 0.02  # weight of a slot that sees a point but not as what moves: a last resort where no slot does
+SELF_EVIDENT = 50.0
+"""By how much a view of the target's time and place counts more: what moves is then 11 dB nearer to the frame that is
+its own (zest-bench's walker), and views from elsewhere keep theirs."""
 EARLY_WIDTH = 24  # of the net that finds the early flow
 CORRECTION = 0.2  # share of the reach by which the trunk corrects the early flow: it was looked up with that one
 
@@ -83,8 +86,18 @@ def early_flow(params: DynamicParams, point: jax.Array, volume: jax.Array, *, re
     return reach * jnp.tanh(raised(dense(second, state)))
 
 
-def dynamic_views(samples: ViewSamples, times: jax.Array) -> ViewFeatures:
-    """`ViewFeatures` of `sample_views` for what moves: seen moving, at its own depth, in its slot."""
+def dynamic_views(samples: ViewSamples, shift: jax.Array, times: jax.Array) -> ViewFeatures:
+    """Per-view features of `sample_views` for what moves: seen moving, at its own depth, in its slot.
+
+    Args:
+      samples: `ViewSamples` of the slots.
+      shift: (V, P) pixels of parallax per plane.
+      times: (V,) frames between the view and the target.
+
+    Returns:
+      `heads.ViewFeatures`; a view of the target's time counts for its colours the more, the nearer it stands to the
+      target: from the same place the answer is at hand, whatever the depth.
+    """
     agree, behind = on_surface(samples.gap), hidden_behind(samples.gap)
     support = samples.visible * samples.moving * agree
     weights = support + HEARSAY * samples.visible * (1 - behind)
@@ -98,7 +111,9 @@ def dynamic_views(samples: ViewSamples, times: jax.Array) -> ViewFeatures:
     ]  # fmt: skip
     features = jnp.concatenate([4 * deviation, jnp.stack(scalars, 1)], 1)
     spread = over_views(weights, jnp.stack([size, agree, through, samples.moving], 1))
-    return ViewFeatures(features, weights, jnp.concatenate([spread, support, through], 0).T)
+    here = jnp.where((times == 0)[:, None], jnp.exp(-jnp.square(shift)), 0)
+    prior = weights * (1 + SELF_EVIDENT * jax.lax.stop_gradient(here))
+    return ViewFeatures(features, weights, prior, jnp.concatenate([spread, support, through], 0).T)
 
 
 def dynamic_field(

@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.numerics import computed_once
 from zestjax.base.parts import part
 from zestjax.fields.conditioning import ViewSamples
 from zestjax.fields.trunk import (
@@ -28,10 +29,12 @@ RESIDUAL = 0.1  # how far a colour may leave what the views show: highlights, no
 
 
 class ViewFeatures(NamedTuple):
-    """Views at points. features: (V, U, P) of each. weights: (V, P) how far it counts. summary: (P, F) of them all."""
+    """Views at points. features: (V, U, P) of each. weights: (V, P) how far it counts, and prior: (V, P) how far its
+    colour does. summary: (P, F) of them all."""
 
     features: jax.Array
     weights: jax.Array
+    prior: jax.Array
     summary: jax.Array
 
 
@@ -89,11 +92,11 @@ class Blend:
     def __call__(self, params, volume, samples, views):
         """See `Head`."""
         lift = lifted(params.views, views.features)
-        condition = jnp.concatenate([volume, pooled_views(lift, views.weights), views.summary], -1)
+        condition = jnp.concatenate([volume, computed_once(pooled_views, lift, views.weights).T, views.summary], -1)
 
         def colour(state, direction):
-            scores = view_scores(params.views, lift, state)
-            shown = blend_of_views(scores, views.weights, samples.visible, samples.colour)
+            scores = computed_once(view_scores, params.views, lift, state)
+            shown = computed_once(blend_of_views, scores, views.prior, samples.visible, samples.colour).T
             residual = direct_colour(params.colour, state, direction) - 0.5
             return jnp.clip(shown + RESIDUAL * residual, 0, 1)
 

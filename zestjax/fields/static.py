@@ -82,7 +82,7 @@ def static_views(samples: ViewSamples, shift: jax.Array, times: jax.Array) -> Vi
     total = added(weights[v] for v in views) / len(views)
     best = added(weights[v] / (1 + shift[v]) for v in views) / len(views)
     summary = jnp.concatenate([spread, total[None], best[None]], 0).T
-    return jax.lax.stop_gradient(ViewFeatures(features, weights, summary))
+    return jax.lax.stop_gradient(ViewFeatures(features, weights, weights, summary))
 
 
 def static_field(

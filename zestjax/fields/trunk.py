@@ -96,12 +96,12 @@ def lifted(params: ViewHead, features: jax.Array) -> list[jax.Array]:
 
 
 def pooled_views(lift: Sequence[jax.Array], weights: jax.Array) -> jax.Array:
-    """(P, width) weighted mean over views of their activated features; weights (V, P), every view at least a little."""
+    """(width, P) weighted mean over views of their activated features; weights (V, P), every view at least a little."""
     weights = weights + 1e-3  # or a point that no view is trusted at had no features
     total = added(weights[v] for v in range(len(lift)))
     share = jax.lax.optimization_barrier(weights / total[None])
     share = lowered(share, lift[0])
-    return raised(added(share[v][None] * jax.nn.relu(view) for v, view in enumerate(lift)).T)
+    return raised(added(share[v][None] * jax.nn.relu(view) for v, view in enumerate(lift)))
 
 
 def view_scores(params: ViewHead, lift: Sequence[jax.Array], hidden: jax.Array) -> jax.Array:
@@ -127,14 +127,14 @@ def blend_of_views(scores: jax.Array, prior: jax.Array, visible: jax.Array, colo
       colour: (V, 3, P).
 
     Returns:
-      (P, 3); 0 where no view sees the point.
+      (3, P); 0 where no view sees the point.
     """
     scores = SCORE_LIMIT * jnp.tanh(scores / SCORE_LIMIT)
     weights = jnp.exp(scores) * (prior + 1e-4) * visible  # where no view is trusted, those that see choose the colour
     views = range(weights.shape[0])
     total = added(weights[v] for v in views)
     mean = added(weights[v][None] * colour[v] for v in views)
-    return (mean / jnp.maximum(total, 1e-9)[None]).T
+    return mean / jnp.maximum(total, 1e-9)[None]
 
 
 def init_colour_head(key: jax.Array, n_hidden: int, n_view: int) -> ColourHead:

@@ -32,9 +32,7 @@ def video_flow(images: Array) -> VideoFlow:
     Returns:
       `VideoFlow`; rows and columns are half the images', rounded up to an even number.
     """
-    images = np.asarray(images)
-    if images.dtype != np.uint8:
-        images = np.round(255 * np.clip(images, 0, 1)).astype(np.uint8)
+    images = as_bytes(images)
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     size = tuple(2 * -(-n // 4) for n in images.shape[1:3])
     flow = np.zeros((len(images), 2, *size, 2), np.float32)
@@ -45,6 +43,18 @@ def video_flow(images: Array) -> VideoFlow:
         flow[i, 0], sure[i, 0] = _halved(there, _agreement(there, back), size)
         flow[i + 1, 1], sure[i + 1, 1] = _halved(back, _agreement(back, there), size)
     return VideoFlow(flow, sure)
+
+
+def as_bytes(images: Array) -> np.ndarray:
+    """Images as uint8; floats are of [0, 1]."""
+    images = np.asarray(images)
+    return images if images.dtype == np.uint8 else np.round(255 * np.clip(images, 0, 1)).astype(np.uint8)
+
+
+def dense_flow(image: Array, other: Array) -> np.ndarray:
+    """(H, W, 2) pixels from one (H, W, 3) uint8 image to another."""
+    grey = (cv2.cvtColor(np.asarray(x), cv2.COLOR_RGB2GRAY) for x in (image, other))
+    return _dense_flow(_search(), *grey)
 
 
 def _search():

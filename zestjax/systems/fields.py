@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_counts, check_option
+from zestjax.base.numerics import computed_once
 from zestjax.base.parts import part
 from zestjax.base.types import Array, Scalar, T
 from zestjax.encoding import Volume, VolumeParams
@@ -135,12 +136,12 @@ class Static(Choices):
         samples = views = None
         if seen.views is not None:
             points = flat(marched.points)[None]
-            samples = sample_views(seen.views, points)
+            samples = computed_once(sample_views, seen.views, points)
             if self.head.looks:
-                shift = parallax(seen.views.cameras, points, flat(marched.beyond)[None])
+                shift = computed_once(parallax, seen.views.cameras, points, flat(marched.beyond)[None])
                 there = seen.views.valid > 0  # an empty slot repeats a real frame, whose camera and time say nothing
                 shift, times = jnp.where(there[:, None], shift, 0), jnp.where(there, seen.views.times, 0)
-                views = static_views(samples, shift, times)
+                views = computed_once(static_views, samples, shift, times)
         point = positional_encoding(flat(marched.coords), levels=self.point_levels)
         reading = self.head(net.head, look_up(seen.volume, flat(marched.coords)), samples, views)
         found = static_field(net, point, directions_of(self, marched), reading, modulation=self.modulation)
@@ -182,10 +183,11 @@ class Dynamic(Choices):
             times = seen.views.times[:, None, None]
             step = jnp.where(times > 0, early[None, :, :3], early[None, :, 3:]) * jnp.abs(times)
             # Where to look is learned from the flow's own losses: no gradient through the gathers.
-            samples = sample_views(seen.views, jax.lax.stop_gradient(place.world(coords[None] + step)))
-            views = dynamic_views(samples, seen.views.times)
+            samples = computed_once(sample_views, seen.views, jax.lax.stop_gradient(place.world(coords[None] + step)))
+            shift = parallax(seen.views.cameras, flat(marched.points)[None], flat(marched.beyond)[None])
+            views = computed_once(dynamic_views, samples, shift, seen.views.times)
         elif seen.views is not None:
-            samples = sample_views(seen.views, place.world(coords)[None])
+            samples = computed_once(sample_views, seen.views, place.world(coords)[None])
         reading, direction = self.head(net.head, volume, samples, views), directions_of(self, marched)
         options: Any = dict(reach=self.reach, early=early, modulation=self.modulation)
         return gridded(dynamic_field(net, point, direction, reading, **options), marched)
@@ -247,7 +249,7 @@ def look_up(volume: Volume | None, coords: jax.Array) -> jax.Array:
     """(P, channels) of a `Volume`'s cells at frustum coordinates (P, 3); no channels without a volume."""
     if volume is None:
         return jnp.zeros((coords.shape[0], 0), coords.dtype)
-    return trilinear(volume.cells, cells_from_frustum(coords, *volume.cells.shape[:3]))
+    return computed_once(trilinear, volume.cells, cells_from_frustum(coords, *volume.cells.shape[:3]))
 
 
 def directions_of(field: Choices, marched: Marched) -> jax.Array:

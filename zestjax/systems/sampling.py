@@ -132,7 +132,8 @@ def march(
     fractions = sampler.fractions(guides, pixels, jitter)
     depths = depths_from_fractions(fractions, near, far, spacing=spacing)
     farther = depths_from_fractions(fractions + 1 / (space.planes - 1), near, far * BEYOND, spacing=spacing)
-    farther = jnp.clip(farther, -FARTHEST * far, FARTHEST * far)  # one plane past the last may be at infinity
+    # One plane past the last may lie at infinity or beyond it, which a rounding decides: it is taken for very far.
+    farther = jnp.where(farther > 0, jnp.minimum(farther, FARTHEST * far), FARTHEST * far)
     along = lambda z: rays.origins[:, None] + z[..., None] * rays.directions[:, None]
     points = along(depths)
     coords = frustum_from_world(frustum, points, spacing=spacing)

@@ -28,6 +28,7 @@ def target_inputs(
     *,
     system: System,
     exclude: Collection[int] = (),
+    stand_in: bool = False,
 ) -> tuple[Inputs, Array]:
     """`Inputs` of a target, and which frames they hold. Anything but what to exclude may be traced: frames are then
     chosen by JAX, and their arrays gathered.
@@ -41,6 +42,7 @@ def target_inputs(
       time: int frame time.
       system: `System`, whose fields choose their frames.
       exclude: see the header.
+      stand_in: the frame of the target's time, which is to be excluded, holds another in its place: it may be a slot.
 
     Returns:
       (`Inputs`, (V,) int frames: those of the static field, then those of the dynamic one).
@@ -55,7 +57,8 @@ def target_inputs(
     chosen = system.static.frames.choose(places, target=centre, time=time, exclude=exclude)
     key, slots, frames = pack(chosen, chosen.frames.astype(now.dtype)), None, [chosen.frames]
     if system.dynamic is not None:
-        around = system.dynamic.frames.choose(places, time=time, exclude=exclude)
+        missing = [i for i in exclude if not (stand_in and i == time)]
+        around = system.dynamic.frames.choose(places, time=time, exclude=missing)
         slots = pack(around, now + np.asarray(system.dynamic.frames.offsets, now.dtype))
         frames.append(around.frames)
     bounds = (_number(x) for x in (len(images), near, far))

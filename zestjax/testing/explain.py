@@ -5,12 +5,14 @@ group  parameters that share the first steps of their path in the tree
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zestjax.base.backend import quick
 from zestjax.base.types import Tree
 from zestjax.testing.origin import Origin, find_origin
 
@@ -69,7 +71,7 @@ def explain_gradient(losses: Callable, params: Tree, *, depth: int = 1) -> Expla
         one = lambda p, term=term: named(p)[term]
         value, leaves = found[0][term], [leaf[i] for leaf in found[1]]
         if not _finite(value, leaves):  # another term's infinity times this one's 0 may have spoilt it: ask it alone
-            value, grads = jax.jit(jax.value_and_grad(one))(params)
+            value, grads = jax.jit(jax.value_and_grad(one), compiler_options=quick())(params)
             leaves = list(map(np.asarray, jax.tree.leaves(grads)))
         if origin is None and not _finite(value, leaves):
             origin = find_origin(one, params, term)
@@ -81,7 +83,7 @@ def explain_gradient(losses: Callable, params: Tree, *, depth: int = 1) -> Expla
 def _gradients(named, terms, params):
     """(values by term, leaves of the gradient with the terms as leading axis), by one program: one forward pass."""
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=quick())
     def both(params):
         values, pull = jax.vjp(named, params)
         chosen = lambda i: {name: jnp.where(i == k, 1, 0).astype(values[name].dtype) for k, name in enumerate(terms)}

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax.base.types import Tree
-from zestjax.testing.walk import bind, place_of, program, run
+from zestjax.testing.walk import bind, branch_taken, place_of, program, run
 
 KINDS = {"nan": np.isnan, "inf": np.isinf}
 PASSING = ("scan", "while")  # visited where they take rows apart and put them together
@@ -113,7 +113,7 @@ def _follow(closed, leaves, names, begin, healed):
             known.setdefault(id(x), (x, origins))
         return x
 
-    result = run(closed, leaves, visit, taken=True)
+    result = run(closed, leaves, visit, choose=branch_taken, turns=True)
     reached = _union(origins_of(x, begin) for x in result)
     return [*(origin for origin in order if origin in reached), *sorted(reached - set(order))], list(order)
 

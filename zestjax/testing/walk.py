@@ -2,6 +2,7 @@
 
 primitive  an operation that JAX does not take apart further
 visit      `visit(equation, inputs, outputs) -> outputs`, called for every primitive in the order of the program
+choose     `choose(index) -> branch` of a `cond`, called in that order too
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +28,14 @@ def program(fn: Callable, *args: Tree) -> tuple[ClosedJaxpr, list[jax.Array], An
     return jaxpr, leaves, jax.tree.structure(shape)
 
 
-def run(closed: ClosedJaxpr, leaves: Sequence[Array], visit: Callable, *, taken: bool = False) -> list[Array]:
+def run(
+    closed: ClosedJaxpr,
+    leaves: Sequence[Array],
+    visit: Callable,
+    *,
+    choose: Callable | None = None,
+    turns: bool = False,
+) -> list[Array]:
     """Outputs of a program; what is compiled, rematerialised or scanned inside is walked through too.
 
     Args:
@@ -35,12 +43,18 @@ def run(closed: ClosedJaxpr, leaves: Sequence[Array], visit: Callable, *, taken:
       leaves: its arguments.
       visit: sees every primitive and may change what it gives. A `scan` is also visited where it takes a row apart and
         where it stacks its turns, so that no array appears that was not visited.
-      taken: walk into the branch that a `cond` takes and the turns that a `while` makes. It needs values, not tracers.
+      choose: walk into the branch of every `cond` that this says; None: the `cond` is one operation.
+      turns: walk into the turns that a `while` makes. It needs values, not tracers.
 
     Returns:
       List of arrays.
     """
-    return _run(closed, leaves, visit, taken)
+    return _run(closed, leaves, visit, (choose, turns))
+
+
+def branch_taken(index: Array) -> int:
+    """The branch that a `cond` takes: `choose` of `run`, where values are known."""
+    return int(index)
 
 
 def contains(closed: ClosedJaxpr | Jaxpr, name: str) -> bool:
@@ -62,28 +76,29 @@ def inner_programs(equation: JaxprEqn) -> list[ClosedJaxpr | Jaxpr]:
     ]  # fmt: skip
 
 
-def _run(closed, leaves, visit, taken):
+def _run(closed, leaves, visit, into):
     jaxpr, consts = _jaxpr(closed), closed.consts if isinstance(closed, ClosedJaxpr) else ()
     known = dict(zip(jaxpr.constvars, consts, strict=True)) | dict(zip(jaxpr.invars, leaves, strict=True))
     read = lambda variable: variable.val if isinstance(variable, Literal) else known[variable]
     for equation in jaxpr.eqns:
         inputs = [read(variable) for variable in equation.invars]
-        known.update(zip(equation.outvars, _outputs(equation, inputs, visit, taken), strict=True))
+        known.update(zip(equation.outvars, _outputs(equation, inputs, visit, into), strict=True))
     return [read(variable) for variable in jaxpr.outvars]
 
 
-def _outputs(equation, inputs, visit, taken):
+def _outputs(equation, inputs, visit, into):
     name, params = equation.primitive.name, equation.params
     within = lambda inside, inputs, outputs: visit(_placed(inside, equation), inputs, outputs)
     if name in INLINED and (inner := inner_programs(equation)):
-        return _run(inner[0], inputs, within, taken)
+        return _run(inner[0], inputs, within, into)
     if name == "scan":
-        return _scan(equation, inputs, within, taken)
-    if name == "cond" and taken:
-        branch = min(max(int(inputs[0]), 0), len(params["branches"]) - 1)
-        return _run(params["branches"][branch], inputs[1:], within, taken)
-    if name == "while" and taken:
-        return _while(equation, inputs, within)
+        return _scan(equation, inputs, within, into)
+    choose, turns = into
+    if name == "cond" and choose:
+        branch = min(max(choose(inputs[0]), 0), len(params["branches"]) - 1)
+        return _run(params["branches"][branch], inputs[1:], within, into)
+    if name == "while" and turns:
+        return _while(equation, inputs, within, into)
     return visit(equation, inputs, bind(equation, inputs))
 
 
@@ -103,7 +118,7 @@ def _placed(equation, caller):
     return equation if place_of(equation) else equation.replace(source_info=caller.source_info)
 
 
-def _scan(equation, inputs, visit, taken):
+def _scan(equation, inputs, visit, into):
     """One turn after the other; the outputs of the turns are stacked again."""
     params = equation.params
     consts, carry = params["num_consts"], params["num_carry"]
@@ -112,7 +127,7 @@ def _scan(equation, inputs, visit, taken):
     found = []
     for i in reversed(turns) if params["reverse"] else turns:
         now = [visit(equation, [row], [row[i]])[0] for row in rows]
-        out = _run(params["jaxpr"], [*fixed, *state, *now], visit, taken)
+        out = _run(params["jaxpr"], [*fixed, *state, *now], visit, into)
         state = out[:carry]
         found.append(out[carry:])
     found = found[::-1] if params["reverse"] else found
@@ -122,7 +137,7 @@ def _scan(equation, inputs, visit, taken):
     return [*state, *(visit(equation, list(turns), [jnp.stack(turns)])[0] for turns in zip(*found, strict=True))]
 
 
-def _while(equation, inputs, visit):
+def _while(equation, inputs, visit, into):
     """Turn by turn while the condition holds; of a mapped loop, those rows move on for which it does."""
     params = equation.params
     asked, made = params["cond_nconsts"], params["body_nconsts"]
@@ -133,8 +148,8 @@ def _while(equation, inputs, visit):
         return visit(equation, [new, old], [jnp.where(goes, new, old)])[0]
 
     while True:
-        (goes,) = _run(params["cond_jaxpr"], [*of_condition, *state], visit, True)
+        (goes,) = _run(params["cond_jaxpr"], [*of_condition, *state], visit, into)
         if not jnp.any(goes):
             return state
-        new = _run(params["body_jaxpr"], [*of_body, *state], visit, True)
+        new = _run(params["body_jaxpr"], [*of_body, *state], visit, into)
         state = [moved(goes, *pair) for pair in zip(new, state, strict=True)] if goes.shape else new

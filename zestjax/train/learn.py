@@ -5,7 +5,6 @@ V        source frames: of the static field, then of the dynamic one
 The volumes are computed once a step, and memory is one block's (`blocks.in_blocks`).
 """
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from zestjax.base.backend import quick
 from zestjax.base.checks import check_option
 from zestjax.base.precision import geometry_at, network_at
 from zestjax.frames.assembly import dequantised
@@ -186,7 +186,9 @@ class Fault(NamedTuple):
 
 def find_fault(objective: Callable, params: Any, batch: Any) -> Fault:
     """`Fault` of a step's losses and gradients; the program of one objective is compiled once, at a step's cost."""
-    grads, terms = _finite(params, batch, objective=objective)
+    grads, terms = jax.jit(_finite, static_argnames="objective", compiler_options=quick())(
+        params, batch, objective=objective
+    )
     named = jax.tree_util.tree_leaves_with_path(grads)
     leaves = tuple(jax.tree_util.keystr(path) for path, good in named if not good)
     lost = tuple(name for name, good in terms.items() if not good)
@@ -194,7 +196,6 @@ def find_fault(objective: Callable, params: Any, batch: Any) -> Fault:
     return Fault(lost, leaves, tuple(map(int, times)))
 
 
-@functools.partial(jax.jit, static_argnames="objective")
 def _finite(params, batch, *, objective):
     """Which gradients and which terms are finite."""
     (_, terms), grads = jax.value_and_grad(objective, has_aux=True)(params, batch)
