@@ -156,7 +156,7 @@ def render_view(
     if maps is None and system.frames is not None:
         raise ValueError(f"{where}: `prepared` has no maps of its frames; prepare the video with the same `system`.")
     time, exclude = check_view(where, video, camera, time, exclude=exclude)
-    between = _stand_in(prepared, time, exclude, system)
+    between = None if traced(camera) else _stand_in(prepared, time, exclude, system)
     if between is not None:
         inputs, maps = _inputs_with(between, params, prepared, camera, time, system=system, exclude=exclude)
         return render_inputs(params, inputs, maps, system=system)

@@ -89,10 +89,9 @@ def lifted(params: ViewHead, features: jax.Array) -> list[jax.Array]:
 
     One product per view, the bias as one more row: the gradients are products too, not slow sums.
     """
-    kernel = jnp.concatenate([params.lift.kernel, params.lift.bias[None]]).T
+    kernel, bias = params.lift.kernel.T, params.lift.bias[:, None]
     features = lowered(features, kernel)
-    ones = jnp.ones_like(features[0, :1])
-    return [kernel @ jnp.concatenate([view, ones]) for view in features]
+    return [kernel @ view + lowered(bias, kernel) for view in features]
 
 
 def pooled_views(lift: Sequence[jax.Array], weights: jax.Array) -> jax.Array:
