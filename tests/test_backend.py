@@ -170,7 +170,10 @@ def test_a_program_compiled_quickly_computes_the_same():
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_compiler_options_are_for_cpus_alone(monkeypatch):
-    assert backend.quick() == {"xla_backend_optimization_level": 0}
+def test_compiler_options_are_those_that_device_and_jaxlib_know(monkeypatch):
+    monkeypatch.setattr(backend, "_jaxlib_version", lambda: (0, 10))
+    assert set(backend.quick()) == {"xla_backend_optimization_level", "xla_cpu_use_fusion_emitters"}
+    monkeypatch.setattr(backend, "_jaxlib_version", lambda: (0, 11))
+    assert set(backend.quick()) == {"xla_backend_optimization_level"}
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert backend.quick() == {}

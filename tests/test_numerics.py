@@ -82,17 +82,10 @@ def test_its_gradient_is_its_slope():
     assert_grads_match(loss, normal(1, 5, 2))
 
 
-@pytest.mark.parametrize("odd", [0.0, -1.0, np.inf, -np.inf, np.nan, 3e38, 1e-45])
-def test_whatever_the_first_number_is_nothing_is_lost(odd):
-    x = normal(2, 6).at[0].set(odd)
-    found = jax.jit(lambda x: numerics.computed_once(lambda x: x + 1, x))(x)
-    np.testing.assert_array_equal(found, x + 1)
-
-
-def test_without_a_number_to_ask_it_is_the_function_itself():
-    np.testing.assert_array_equal(numerics.computed_once(lambda x: x + 1, jnp.arange(3)), [1, 2, 3])
-    empty = jnp.zeros((0, 3))
-    assert numerics.computed_once(lambda x: x + 1, empty).shape == (0, 3)
+@pytest.mark.parametrize("x", [jnp.arange(3), jnp.zeros((0, 3)), jnp.array([jnp.nan, jnp.inf, 1])])
+def test_it_asks_nothing_of_its_arguments(x):
+    for wrap in (lambda fn: fn, jax.jit, lambda fn: jax.jit(lambda _: fn(x))):  # the last: a constant of the program
+        np.testing.assert_array_equal(wrap(lambda x: numerics.computed_once(lambda x: x + 1, x))(x), x + 1)
 
 
 def test_the_compiler_leaves_it_alone():

@@ -11,7 +11,8 @@ from stage import MINI, PAPER
 
 from zestjax.cameras import Camera
 from zestjax.frames.selection import key_frames, neighbours
-from zestjax.novel_view import prepare, render_view
+from zestjax.novel_view import prepare, render_inputs, render_view
+from zestjax.testing import quick
 
 CAMERA = jax.tree.map(jnp.asarray, stage.camera(0.1))
 
@@ -119,3 +120,14 @@ def test_what_is_traced_is_looked_at_too(scene, change, words):
 @pytest.mark.parametrize("time", [-4, -1, stage.FRAMES, stage.FRAMES + 9])
 def test_a_traced_time_outside_the_video_has_no_slots_and_is_finite(scene, time):
     assert np.isfinite(jax.jit(lambda time: colour(scene, CAMERA, time))(time)).all()
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["known while compiling", "given"])
+def test_a_view_compiled_quickly_is_the_view(known):
+    """Rows of the sources lie on rows of the target: which one is read must not hang on how sums are rounded."""
+    params, (inputs, frames) = stage.params_of(MINI), stage.inputs_of(MINI)
+    maps = jax.tree.map(lambda x: x[frames], prepare(params, stage.video(), system=MINI).maps)
+    view = lambda inputs: render_inputs(params, inputs, maps, system=MINI)
+    fn, args = (lambda: view(inputs), ()) if known else (view, (inputs,))
+    compiled = lambda options: jax.jit(fn, compiler_options=options)(*args).colour
+    close(compiled(quick()), compiled({"xla_backend_optimization_level": 3}))

@@ -156,7 +156,7 @@ def render_view(
     if maps is None and system.frames is not None:
         raise ValueError(f"{where}: `prepared` has no maps of its frames; prepare the video with the same `system`.")
     time, exclude = check_view(where, video, camera, time, exclude=exclude)
-    between = None if traced(camera) else _stand_in(prepared, time, exclude, system)
+    between = _stand_in(prepared, time, exclude, system)
     if between is not None:
         inputs, maps = _inputs_with(between, params, prepared, camera, time, system=system, exclude=exclude)
         return render_inputs(params, inputs, maps, system=system)
@@ -165,12 +165,9 @@ def render_view(
     )
     if system.frames is None:
         maps = None
-    elif exclude and traced(frames):  # which frames serve is not known: the evidence of all is found without those
-        check_known(where, prepared=prepared)
-        maps = _frame_maps(params, prepared.footage, video, system, exclude=exclude)
-        maps = jax.tree.map(lambda x: x[frames], maps)
     elif exclude:
-        maps = _frame_maps(params, prepared.footage, video, system, frames=frames, exclude=exclude)
+        check_known(where, prepared=prepared)
+        maps = _maps_without(params, prepared.footage, video, system, frames, exclude)
     else:
         maps = jax.tree.map(lambda x: x[frames], maps)
     return render_inputs(params, inputs, maps, system=system)
@@ -183,7 +180,8 @@ def _stand_in(prepared, time, exclude, system):
         return None
     if 0 not in getattr(system.dynamic.frames, "offsets", ()):
         return None
-    return with_stand_in(prepared.video, prepared.footage, time, exclude=exclude)
+    with jax.ensure_compile_time_eval():  # the video is known also where a camera is traced
+        return with_stand_in(prepared.video, prepared.footage, time, exclude=exclude)
 
 
 def _inputs_with(between, params, prepared, camera, time, *, system, exclude):
@@ -193,9 +191,16 @@ def _inputs_with(between, params, prepared, camera, time, *, system, exclude):
         video.images, video.cameras, video.near, video.far, camera, time, system=system, exclude=exclude, stand_in=True
     )
     count, missing = len(inputs.key.valid), tuple(i for i in exclude if i != time)
-    of_key = _frame_maps(params, prepared.footage, prepared.video, system, frames=frames[:count], exclude=exclude)
-    of_slots = _frame_maps(params, seen, video, system, frames=frames[count:], exclude=missing)
+    of_key = _maps_without(params, prepared.footage, prepared.video, system, frames[:count], exclude)
+    of_slots = _maps_without(params, seen, video, system, frames[count:], missing)
     return inputs, jax.tree.map(lambda *parts: jnp.concatenate(parts), of_key, of_slots)
+
+
+def _maps_without(params, seen, video, system, frames, exclude):
+    """`FrameMaps` of frames, without what others have of those excluded: of all frames where it is not known which."""
+    if not traced(frames):
+        return _frame_maps(params, seen, video, system, frames=frames, exclude=exclude)
+    return jax.tree.map(lambda x: x[frames], _frame_maps(params, seen, video, system, exclude=exclude))
 
 
 @functools.partial(jax.jit, static_argnames=("system", "rows"))

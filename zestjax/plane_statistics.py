@@ -60,29 +60,38 @@ class Sweep(NamedTuple):
     floor: float | None
 
 
+class _Placed(NamedTuple):
+    """Where a view sees the points of a block of planes. across, down: see `Cells`. share: of the plane's depth."""
+
+    across: jax.Array
+    down: jax.Array
+    share: jax.Array
+
+
 def _place(sweep, homography, grid):
-    """Cells of one view for a block of planes: (b, 3, 3) -> `Cells` of (b, h, w), share of the depth, who sees."""
+    """(`_Placed`, (first, seen)) of one view: (b, 3, 3) -> (b, h, w), its table rows and who sees.
+
+    Once for what is gathered and for what is interpolated: `rounded_once` says why.
+    """
     u, v, share, in_front = carry(homography, grid)
     cells = bilinear_cells(u, v, sweep.height, sweep.width)
-    return cells, share, cells.inside & in_front
+    return _Placed(cells.across, cells.down, share), (cells.first, cells.inside & in_front)
 
 
-def _read(sweep, corners, homography, depth, grid):
+def _read(sweep, corners, placed, seen, depth):
     """Value (b, h, w, C) and weight (b, h, w) of one view, from the table rows at the corners of its cells."""
-    cells, share, seen = _place(sweep, homography, grid)
-    rows = interpolate(corners, cells.across, cells.down)
+    rows = interpolate(corners, placed.across, placed.down)
     value, weight = rows[..., : sweep.channels], seen.astype(rows.dtype)
     if sweep.floor is not None:
         static, inverse_depth, tolerance = (rows[..., sweep.channels + k] for k in range(3))
-        point = 1 / jnp.where(seen, share * depth[:, None, None], 1)
+        point = 1 / jnp.where(seen, placed.share * depth[:, None, None], 1)
         tolerance = jnp.where(seen, tolerance, 1)
         weight *= sweep.floor + (1 - sweep.floor) * trusted(static, inverse_depth, tolerance, point)
     return value, weight, jnp.where(seen[..., None], value[..., sweep.channels - sweep.per_view :], 0)
 
 
-def _gather(sweep, table, homography, grid):
-    cells, _, _ = _place(sweep, homography, grid)
-    return cells.first, gather_corners(table, cells.first, corner_offsets(sweep.height, sweep.width))
+def _gather(sweep, table, first):
+    return gather_corners(table, first, corner_offsets(sweep.height, sweep.width))
 
 
 def _block(sweep, flat, homographies, depth, grid):
@@ -91,8 +100,8 @@ def _block(sweep, flat, homographies, depth, grid):
     def view(state, inputs):
         count, mean, spread = state
         table, homography = inputs
-        _, corners = _gather(sweep, table, homography, grid)
-        value, weight, sample = _read(sweep, corners, homography, depth, grid)
+        placed, (first, seen) = _place(sweep, homography, grid)
+        value, weight, sample = _read(sweep, _gather(sweep, table, first), placed, seen, depth)
         count = count + weight
         share = weight / jnp.where(count > 0, count, 1)
         delta = value - mean
@@ -132,18 +141,17 @@ def _stream_backward(sweep, saved, cotangent):
 
         def block(table_gradient, inputs):
             homography, depth, volume, given, sample_gradient = inputs
-            first, corners = _gather(sweep, table, homography, grid)
-            read = lambda corners, homography: _read(sweep, corners, homography, depth, grid)
-            if turned is None:
-                (value, weight, sample), pull = jax.vjp(lambda corners: read(corners, homography), corners)
-            else:
-                (value, weight, sample), pull = jax.vjp(read, corners, homography)
+            place = lambda homography: _place(sweep, homography, grid)
+            placed, turn, (first, seen) = jax.vjp(place, homography, has_aux=True)
+            read = lambda corners, placed: _read(sweep, corners, placed, seen, depth)
+            (value, weight, sample), pull = jax.vjp(read, _gather(sweep, table, first), placed)
             sample_gradient = jnp.zeros_like(sample) if sample_gradient is None else sample_gradient
-            rows, *rest = pull((*_view_gradient(value, weight, volume, given), sample_gradient))
+            rows, towards = pull((*_view_gradient(value, weight, volume, given), sample_gradient))
+            turns = () if turned is None else turn(towards)  # what is not used is not in the program
             for offset, row in zip(corner_offsets(sweep.height, sweep.width), rows, strict=True):
                 at = table_gradient.at[first + offset]
                 table_gradient = at.add(row, mode="promise_in_bounds", wrap_negative_indices=False)
-            return table_gradient, rest
+            return table_gradient, turns
 
         blocks = (homographies, depths, volume, given, sample_gradients)
         return None, lax.scan(block, jnp.zeros_like(table), blocks)

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from zestjax.base.checks import check_option, check_shapes
+from zestjax.base.numerics import rounded_once
 from zestjax.base.types import Array
 
 EDGE = 1e-3  # pixels: rounding of a float32 homography; a point this far outside still counts as on the border
@@ -67,7 +68,10 @@ def bilinear_cells(u: Array, v: Array, height: int, width: int) -> Cells:
 
     A point counts as inside up to 0.001 pixels beyond the outer samples.
     """
-    u, v = jnp.asarray(u), jnp.asarray(v)
+    return _cells(*rounded_once((jnp.asarray(u), jnp.asarray(v))), height, width)
+
+
+def _cells(u, v, height, width):
     inside = (u >= -EDGE) & (u <= width - 1 + EDGE) & (v >= -EDGE) & (v <= height - 1 + EDGE)
     column, across = split(jnp.clip(u, 0, width - 1), width)
     row, down = split(jnp.clip(v, 0, height - 1), height)
@@ -107,12 +111,11 @@ def bilinear(image: Array, pixels: Array, *, border: str = "zero") -> Sampled:
     sizes = check_shapes("bilinear", image=(image, "H W C"), pixels=(pixels, "... 2"))
     check_option("bilinear", border=(border, ("zero", "clamp")))
     height, width = sizes["H"], sizes["W"]
-    u, v = pixels[..., 0], pixels[..., 1]
-    cells = bilinear_cells(u, v, height, width)
+    u, v = rounded_once((pixels[..., 0], pixels[..., 1]))
+    cells = _cells(u, v, height, width)
     if border == "zero":  # the double where: a point outside touches neither the value nor the gradient
-        cells = bilinear_cells(jnp.where(cells.inside, u, 0), jnp.where(cells.inside, v, 0), height, width)._replace(
-            inside=cells.inside
-        )
+        within = _cells(jnp.where(cells.inside, u, 0), jnp.where(cells.inside, v, 0), height, width)
+        cells = within._replace(inside=cells.inside)
     corners = gather_corners(image.reshape(-1, sizes["C"]), cells.first, corner_offsets(height, width))
     values = interpolate(corners, cells.across, cells.down)
     if border == "zero":
@@ -137,6 +140,7 @@ def trilinear(volume: Array, cells: Array, *, border: str = "clamp") -> jax.Arra
     sizes = check_shapes("trilinear", volume=(volume, "D H W C"), cells=(cells, "... 3"))
     check_option("trilinear", border=(border, ("clamp", "zero")))
     depth, height, width = shape = volume.shape[:3]
+    cells = rounded_once(jnp.asarray(cells))
     within = lambda axis: (cells[..., axis] >= -EDGE) & (cells[..., axis] <= shape[axis] - 1 + EDGE)
     inside = within(0) & within(1) & within(2)
     if border == "zero":

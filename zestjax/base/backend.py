@@ -17,6 +17,7 @@ FLAG = "--xla_cpu_experimental_ynn_fusion_type"  # of the fusion that sums wrong
 KNOWN = ((0, 10), (0, 13))  # jaxlib from, to: tried on 0.10.0 to 0.12.0; XLA stops the process at a flag that is gone
 LEAST_ROWS = 40_000  # above the 32,768 up to which jaxlib 0.10.2 is right
 LARGEST_ERROR = 1e-4  # relative: the wrong sums are off by 1, right ones by 1e-7
+LAST_WITH_TWO_EMITTERS = (0, 10)  # of jaxlib: later ones generate code in one way, and know no option of it
 REMEDY = (
     f"set XLA_FLAGS={FLAG}= (nothing after the equals sign) before Python starts, or import zestjax before "
     "anything computes with JAX."
@@ -58,20 +59,22 @@ def decide() -> Decision:
     return Decision("off", os.environ["XLA_FLAGS"])
 
 
-def quick() -> dict[str, int]:
+def quick() -> dict[str, bool | int]:
     """Compiler options for a program that runs a few times, as a gradient that is checked: `jax.jit(f,
     compiler_options=quick())`.
 
-    The gradient of a whole system's objective compiles in 60 % of the time and takes two to four times as long to run
-    (README, "Compiling"); values differ by roundings. JAX takes options where a program is compiled, not in a function
-    that another `jit` or `grad` traces. Empty where the default device is no CPU.
-
-    XLA's older way to generate code (`xla_cpu_use_fusion_emitters` off, jaxlib 0.10) would halve the time again, and is
-    not among the options: at this level it computes a product of joined arrays wrongly.
+    The gradient of a whole system's objective compiles in a fifth of the time and takes two to four times as long to
+    run (README, "Compiling"); values differ by roundings. JAX takes options where a program is compiled, not in a
+    function that another `jit` or `grad` traces. Empty where the default device is no CPU.
     """
     import jax
 
-    return {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else {}
+    if jax.default_backend() != "cpu":
+        return {}
+    options: dict[str, bool | int] = {"xla_backend_optimization_level": 0}
+    if _jaxlib_version() <= LAST_WITH_TWO_EMITTERS:
+        options["xla_cpu_use_fusion_emitters"] = False
+    return options
 
 
 def sum_error(*, rows: int = LEAST_ROWS, seed: int = 0) -> float:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
+from zestjax.base.numerics import rounded_once
 from zestjax.base.types import Array
 
 SIDE = 4  # pixels to a cell
@@ -62,7 +63,7 @@ def nearest_cells(maps: Array, pixels: Array) -> jax.Array:
       (R, 5 G): of the cell above left, above right, below left and below right, and what is between them linearly.
     """
     height, width = maps.shape[1:]
-    place = (pixels - CENTRE) / SIDE
+    place = rounded_once((pixels - CENTRE) / SIDE)
     last = jnp.array([[max(width - 2, 0), max(height - 2, 0)]], place.dtype)
     base = jnp.clip(jnp.floor(place), 0, last)
     across, down = jnp.moveaxis(jnp.clip(place - base, 0, 1), -1, 0)[:, None]

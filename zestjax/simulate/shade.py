@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zestjax.base.numerics import added
+from zestjax.base.numerics import added, rounded_once
 from zestjax.base.types import Array, Scalar
 from zestjax.simulate.cast import Hit, Placed, Vector, along, blocked, dot
 from zestjax.simulate.textures import LEVELS, TILE
@@ -50,7 +50,7 @@ def surface(placed: Placed, hit: Hit, origin: Vector, direction: Vector, *, boxe
 
 def _texel_range(coordinate, side):
     """The two texels a mirrored tile coordinate lies between, and its share of the second."""
-    place = (1 - jnp.abs(jnp.mod(coordinate, 2) - 1)) * side.astype(coordinate.dtype) - 0.5
+    place = rounded_once((1 - jnp.abs(jnp.mod(coordinate, 2) - 1)) * side.astype(coordinate.dtype) - 0.5)
     low = jnp.floor(place)
     first = low.astype(jnp.int32)
     return jnp.maximum(first, 0), jnp.minimum(first + 1, side - 1), place - low
