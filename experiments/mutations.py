@@ -71,7 +71,8 @@ MUTATIONS = {
         ("return jnp.maximum(jnp.asarray(size) - 1, 1)", "return jnp.asarray(size) - 1"),
     ],
     "plane_statistics": [
-        ("point = 1 / jnp.where(seen, share * depth[:, None, None], 1)", "point = 1 / (share * depth[:, None, None])"),
+        ("point = 1 / jnp.where(seen, placed.share * depth[:, None, None], 1)",
+         "point = 1 / (placed.share * depth[:, None, None])"),
         ("share = weight / jnp.where(count > 0, count, 1)", "share = weight / count"),
         ("variance = spread / jnp.where(count > 0, count, 1)[..., None]", "variance = spread / count[..., None]"),
     ],

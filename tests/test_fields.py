@@ -262,9 +262,10 @@ def both(colour, visible, moving, gap, volume):
     early = dynamic.early_flow(moved, point, volume, reach=0.15)
     of_still = BLEND(still.head, volume, samples, static.static_views(samples, shift, times))
     of_moved = BLEND(moved.head, volume, samples, dynamic.dynamic_views(samples, shift, times))
+    shown = dynamic.shown_moving(samples, shift, times)
     return (
         static.static_field(still, point, direction, of_still),
-        dynamic.dynamic_field(moved, point, direction, of_moved, reach=0.15, early=early),
+        dynamic.dynamic_field(moved, point, direction, of_moved, reach=0.15, early=early, shown=shown),
         static.static_field(direct, point, direction, DIRECT(direct.head, volume, samples, None)),
     )
 
@@ -298,13 +299,17 @@ def test_fields_match_finite_differences(x64):
 
 
 def test_a_view_that_sees_nothing_changes_no_field():
-    colour, visible, moving, gap, volume = seen()
-    visible = visible.at[1].set(0)
-    show = lambda level: jax.jit(both)(
-        colour.at[1].set(level), visible, moving.at[1].set(level), gap.at[1].set(level), volume
-    )
-    nothing, still_nothing = show(0.0), show(0.0)
+    points = jnp.asarray(np.random.default_rng(1).uniform([-1, -0.8, 1.5], [1, 0.8, 4], (1, P, 3)), jnp.float32)
+    tables, volume = uniform(0, V, 8, 12, 6), seen()[-1]
+
+    def show(level):
+        found = conditioning.sample_views(views_of(tables.at[1].set(level), [1, 0, 1]), points)
+        return both(found.colour, found.visible, found.moving, found.gap, volume)
+
+    nothing, still_nothing = (jax.jit(show)(level) for level in (0.0, 1.0))
     jax.tree.map(np.testing.assert_array_equal, nothing, still_nothing)
+    colour, visible, moving, gap, _ = seen()
+    visible = visible.at[1].set(0)
     weights = static.static_views(ViewSamples(colour, visible, moving, gap), uniform(7, V, P), jnp.arange(3.0)).weights
     assert (weights[1] == 0).all() and (weights[0] > 0).all()
 
@@ -355,6 +360,27 @@ def test_from_the_targets_own_time_and_place_the_colour_is_what_is_seen_there():
     elsewhere = shown_by(1, [0, 1, 1], [0.0, 0.0, 3.0], parallax=4.0)
     assert (colour[:, 0] > 0.3).all() and (colour[:, 0] > 10 * elsewhere[:, 0]).all()
     np.testing.assert_allclose(shown_by(1, [1, 1, 1], [0.0, 0.0, 0.0], parallax=0.0)[:, 0], 1, atol=0.1)
+
+
+def test_what_moves_is_shown_by_a_view_of_the_targets_time_and_place_alone():
+    fill = lambda rows: jnp.broadcast_to(jnp.asarray(rows, jnp.float32)[:, None], (V, P))
+    told = lambda moving, visible, shift, times: dynamic.shown_moving(
+        conditioning.ViewSamples(jnp.zeros((V, 3, P)), fill(visible), fill(moving), fill([0] * V)),
+        fill(shift), jnp.asarray(times, jnp.float32),
+    )  # fmt: skip
+    np.testing.assert_allclose(told([0.7, 1, 1], [1, 1, 1], [0, 0, 0], [0, -1, 1]), 0.7)
+    np.testing.assert_allclose(told([0.7, 1, 1], [0, 1, 1], [0, 0, 0], [0, -1, 1]), 0)
+    np.testing.assert_allclose(told([1, 1, 1], [1, 1, 1], [1, 0, 0], [0, -1, 1]), np.exp(-1), rtol=1e-6)
+    np.testing.assert_allclose(told([1, 1, 1], [1, 1, 1], [200, 0, 0], [0, -1, 1]), 0)
+
+
+def test_the_blend_is_told_of_it():
+    wide, (params, point) = jnp.ones((V, P)), (fields()[1], uniform(5, P, 3))
+    samples = ViewSamples(coloured(), wide, wide, 0 * wide)
+    views = dynamic.dynamic_views(samples, 9 * wide, jnp.arange(3.0))
+    reading = BLEND(params.head, uniform(6, P, CHANNELS), samples, views)
+    blend = lambda shown: dynamic.dynamic_field(params, point, point, reading, shown=shown).blend_logit
+    np.testing.assert_allclose(blend(jnp.full(P, 0.5)) - blend(None), 0.5 * dynamic.SHOWN, rtol=1e-5)
 
 
 def test_without_views_or_volume_a_field_is_conditioned_on_a_constant():

@@ -63,9 +63,9 @@ class Sweep(NamedTuple):
 class _Placed(NamedTuple):
     """Where a view sees the points of a block of planes. across, down: see `Cells`. share: of the plane's depth."""
 
-    across: jax.Array
-    down: jax.Array
-    share: jax.Array
+    across: Array
+    down: Array
+    share: Array
 
 
 def _place(sweep, homography, grid):

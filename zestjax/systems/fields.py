@@ -16,7 +16,7 @@ from zestjax.base.types import Array, Scalar, T
 from zestjax.encoding import Volume, VolumeParams
 from zestjax.fields import dynamic, static
 from zestjax.fields.conditioning import SourceViews, parallax, sample_views
-from zestjax.fields.dynamic import DynamicParams, dynamic_field, dynamic_views, early_flow
+from zestjax.fields.dynamic import DynamicParams, dynamic_field, dynamic_views, early_flow, shown_moving
 from zestjax.fields.heads import Blend, Head
 from zestjax.fields.static import StaticParams, static_field, static_views
 from zestjax.fields.trunk import MODULATIONS
@@ -177,19 +177,21 @@ class Dynamic(Choices):
         when = jnp.broadcast_to(2 * place.time / place.duration - 1, (coords.shape[0], 1)).astype(coords.dtype)
         point = positional_encoding(jnp.concatenate([coords, when], axis=-1), levels=self.point_levels)
         volume = look_up(seen.volume, coords)
-        samples = views = early = None
+        samples = views = early = shown = None
         if self.head.looks:
             early = early_flow(net, point, volume, reach=self.reach)
             times = seen.views.times[:, None, None]
             step = jnp.where(times > 0, early[None, :, :3], early[None, :, 3:]) * jnp.abs(times)
             # Where to look is learned from the flow's own losses: no gradient through the gathers.
             samples = computed_once(sample_views, seen.views, jax.lax.stop_gradient(place.world(coords[None] + step)))
-            shift = parallax(seen.views.cameras, flat(marched.points)[None], flat(marched.beyond)[None])
+            points, beyond = flat(marched.points)[None], flat(marched.beyond)[None]
+            shift = computed_once(parallax, seen.views.cameras, points, beyond)
             views = computed_once(dynamic_views, samples, shift, seen.views.times)
+            shown = shown_moving(samples, shift, seen.views.times)
         elif seen.views is not None:
             samples = computed_once(sample_views, seen.views, place.world(coords)[None])
         reading, direction = self.head(net.head, volume, samples, views), directions_of(self, marched)
-        options: Any = dict(reach=self.reach, early=early, modulation=self.modulation)
+        options: Any = dict(reach=self.reach, early=early, shown=shown, modulation=self.modulation)
         return gridded(dynamic_field(net, point, direction, reading, **options), marched)
 
 
