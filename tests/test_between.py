@@ -117,3 +117,12 @@ def test_the_frame_that_is_stood_in_for_is_not_read():
 
 def test_where_nothing_can_stand_in_there_is_none():
     assert between.with_stand_in(posed(film()), footage(film()), 0, exclude=(0,)) is None
+
+
+def test_frames_that_have_little_in_common_make_no_stand_in():
+    """Photographs from far apart: their flow is a guess, which a view must not believe."""
+    noise = np.random.default_rng(0).integers(0, 256, (6, HEIGHT, WIDTH, 3), np.uint8)
+    images = np.stack([cv2.GaussianBlur(image, (0, 0), 2) for image in noise])
+    far, near = (between.flow_interpolation(x, 2).sure for x in (images, film()))
+    assert far < 0.5 < between.LEAST_SURE < near
+    assert between.with_stand_in(posed(images), footage(images), 2, exclude=(2,)) is None

@@ -40,8 +40,8 @@ def video_flow(images: Array) -> VideoFlow:
     search = _search()
     for i in range(len(images) - 1):
         there, back = _dense_flow(search, grey[i], grey[i + 1]), _dense_flow(search, grey[i + 1], grey[i])
-        flow[i, 0], sure[i, 0] = _halved(there, _agreement(there, back), size)
-        flow[i + 1, 1], sure[i + 1, 1] = _halved(back, _agreement(back, there), size)
+        flow[i, 0], sure[i, 0] = _halved(there, agreement(there, back), size)
+        flow[i + 1, 1], sure[i + 1, 1] = _halved(back, agreement(back, there), size)
     return VideoFlow(flow, sure)
 
 
@@ -73,8 +73,8 @@ def _dense_flow(search, image, other):
     return search.calc(image, other, None)
 
 
-def _agreement(there, back):
-    """(H, W) exp(-(|there + back| / 1.5 pixels)^2), 0 where the flow leaves the image."""
+def agreement(there: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """(H, W) exp(-(|there + back| / 1.5 pixels)^2) of flows (H, W, 2), 0 where the flow there leaves the image."""
     height, width = there.shape[:2]
     v, u = np.mgrid[:height, :width].astype(np.float32)
     x, y = u + there[..., 0], v + there[..., 1]
