@@ -34,7 +34,7 @@ demo: $(VENV)/installed
 	$(VENV)/bin/zestjax demo --out runs/demo
 
 bench: $(VENV)/installed
-	for script in experiments/benchmarks/*.py; do $(RUN) $$script || exit 1; done
+	$(RUN) experiments/bench.py --out runs/bench
 
 # 3,000 damaged files of every format: each loads, or is refused by one line that names it.
 fuzz: $(VENV)/installed
