@@ -118,14 +118,14 @@ figure.tight_layout(pad=0.3)
 # %% [markdown]
 # What to look for:
 #
-# - without `flow3d` what moves falls apart: the flow says where a point is in the neighbouring frames, and a wrong
-#   one fetches the wrong colours, however sure the mask is;
-# - without `mask` nothing says which pixels move, and the dynamic field's share of them is the least of all: to 0.7 or
-#   to nearly nothing, depending on the first parameters. The static field then paints the mover where it sees it,
-#   which on the clip it learned from is good enough to fool the score;
-# - without `frame_ce` what moves loses some decibels: each frame's own depth says whom to trust there;
-# - the other three change less than another draw of the first parameters does (1.5 dB of the static field's column).
+# - without `flow3d` what moves loses most, though the dynamic field takes more of it than in any other row: the flow says
+#   where a point is in the neighbouring frames, and a wrong one fetches the wrong colours, however sure the mask is;
+# - without `mask` nothing says which pixels move, and the dynamic field's share of them is the least of all. The static
+#   field then paints the mover where it sees it, which on the clip it learned from is good enough to fool the score;
+# - without `frame_ce` it is the same in part: a frame says less of what moves, the static field learns the mover by heart,
+#   and the score of one clip is the better for it. The depths are the worst of all;
+# - `depth_ce` changes little here, and tenths of a decibel say nothing: there was one draw of the first parameters.
 #   On one clip the colours alone tell the model most of it; what these terms are for shows on scenes that it has not
 #   seen.
 #
-# A clip of 32 x 48 pixels and 120 steps are a sketch; the ablation of the whole system is in `experiments/study.py`.
+# A clip of 32 x 48 pixels and 400 steps are a sketch; the ablation of the whole system is in `experiments/study.py`.
