@@ -118,12 +118,13 @@ figure.tight_layout(pad=0.3)
 # %% [markdown]
 # What to look for:
 #
-# - without `flow3d` what moves loses most, though the dynamic field takes more of it than in any other row: the flow says
-#   where a point is in the neighbouring frames, and a wrong one fetches the wrong colours, however sure the mask is;
+# - without `flow3d` what moves loses most, though the dynamic field takes more of it than in any other row: the flow
+#   says where a point is in the neighbouring frames, and a wrong one fetches the wrong colours, however sure the mask
+#   is;
 # - without `mask` nothing says which pixels move, and the dynamic field's share of them is the least of all. The static
 #   field then paints the mover where it sees it, which on the clip it learned from is good enough to fool the score;
-# - without `frame_ce` it is the same in part: a frame says less of what moves, the static field learns the mover by heart,
-#   and the score of one clip is the better for it. The depths are the worst of all;
+# - without `frame_ce` it is the same in part: a frame says less of what moves, the static field learns the mover by
+#   heart, and the score of one clip is the better for it. The depths are the worst of all;
 # - `depth_ce` changes little here, and tenths of a decibel say nothing: there was one draw of the first parameters.
 #   On one clip the colours alone tell the model most of it; what these terms are for shows on scenes that it has not
 #   seen.

@@ -14,6 +14,7 @@ import numpy as np
 
 from zestjax.simulate.clips import training_clip
 from zestjax.solve import Adam
+from zestjax.testing import quick
 from zestjax.train.batches import batch_from_clip, prepare_clip
 from zestjax.train.learn import training_objective
 from zestjax.train.recipes import TINY
@@ -68,7 +69,7 @@ print(f"eight together: {1e3 * together:.0f} ms a step; one after the other: {8e
 
 # %%
 judge = training_objective(system, weights=dict(rec=1.0, mask=1.0))
-terms = jax.jit(jax.vmap(lambda params, batch: judge(params, batch)[1], in_axes=(0, None)))
+terms = jax.jit(jax.vmap(lambda params, batch: judge(params, batch)[1], in_axes=(0, None)), compiler_options=quick())
 
 
 def judged(batches):
@@ -112,5 +113,5 @@ def after_a_step(mask, params, state):
 
 
 first = jax.tree.map(lambda x: x[3], (params, state))
-slope = jax.jit(jax.grad(after_a_step))(MASK[3], *first)
+slope = jax.jit(jax.grad(after_a_step), compiler_options=quick())(MASK[3], *first)
 print(f"slope of the unseen scene's colour error in the weight of the mask at {MASK[3]:g}: {float(slope):+.2e}")
