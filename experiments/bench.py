@@ -1,6 +1,6 @@
 """Every benchmark, one after the other, in one file and one table.
 
-    python experiments/bench.py [--out runs/bench] [--only model growth] [--with "--preset tiny"]
+    python experiments/bench.py [--out runs/bench] [--only model growth --with "--preset tiny"]
 
 Each of `experiments/benchmarks` is a process of its own, and prints a JSON line for each thing that it times; its
 lines are shown as they come. `bench.json` has the machine, the versions and flags, and all lines; `table.md` is for
@@ -92,7 +92,7 @@ def main():
     parser = argparse.ArgumentParser(description="Runs every benchmark into one file and one table.")
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
     parser.add_argument("--only", nargs="+", default=list(scripts), choices=list(scripts))
-    parser.add_argument("--with", dest="more", default="", help="more options, for each of them")
+    parser.add_argument("--with", dest="more", default="", help="more options, that each of them must know")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     about, found, failed = machine(), {}, []

@@ -84,7 +84,7 @@ def test_the_share_of_the_way_runs_from_the_better_floor_to_the_ceiling():
     row = report(25.0)
     assert scoring.share_of_the_way(row["mean"], row["floors"], row["ceiling"]) == 0.5
     assert scoring.share_of_the_way(row["mean"], row["floors"], None) is None
-    assert "full 25.00 dB (+5.00 on the better floor)" in tables.headline(row)
+    assert "full 25.00 dB (+5.00 on the best floor)" in tables.headline(row)
 
 
 def test_the_table_ends_with_the_mean_and_every_row_has_every_column(tmp_path):

@@ -122,6 +122,8 @@ def test_the_strict_protocol_never_shows_a_target_to_the_model(places, grey, mon
     )
     assert run(places, "evaluate", "--protocol", "strict", "--targets", "1,4", "--no-pictures", "--quiet") == 0
     assert set(asked) == {(1, (1,)), (4, (4,))}
+    floors = json.loads((places / "out/evaluate/metrics.json").read_text())["floors"]
+    assert floors["flow_interpolation"]["full"]["psnr"] > 0
 
 
 def test_evaluate_says_once_what_a_scene_lacks_and_what_is_null_for_it(places, grey, capsys):

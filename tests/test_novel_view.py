@@ -10,6 +10,7 @@ import stage
 from stage import MINI, PAPER, STILL
 
 from zestjax import novel_view
+from zestjax.fields import dynamic
 from zestjax.model import predict
 from zestjax.novel_view import prepare, render_inputs, render_view
 from zestjax.rays import pixel_grid
@@ -74,7 +75,9 @@ def test_an_excluded_frame_influences_nothing(scene):
     video = stage.video()
     images = video.images.copy()
     images[2] = 1 - images[2]
-    changed = video._replace(images=images)
+    away = video.cameras.camera_from_world.copy()
+    away[2, 0, 3] += 0.5
+    changed = video._replace(images=images, cameras=video.cameras._replace(camera_from_world=away))
     views = [
         render_view(params, prepare(params, v, system=MINI), CAMERA, 2, system=MINI, exclude=(2,))
         for v in (video, changed)
@@ -82,6 +85,28 @@ def test_an_excluded_frame_influences_nothing(scene):
     assert same(*views)
     free = [render_view(params, prepare(params, v, system=MINI), CAMERA, 2, system=MINI) for v in (video, changed)]
     assert not same(*free) and not same(views[0], free[0])
+
+
+def test_where_the_frame_of_its_time_is_missing_another_stands_in_for_it(scene, monkeypatch):
+    show = lambda: render_view(*scene, CAMERA, 2, system=MINI, exclude=(2,))
+    stood = show()
+    held = jax.device_get(scene[1])  # as from a file
+    assert same(render_view(scene[0], held, CAMERA, 2, system=MINI, exclude=(2,)), stood)
+    monkeypatch.setattr(novel_view, "with_stand_in", lambda *_, **__: None)
+    assert not same(show(), stood)
+
+
+def test_what_moves_is_shown_where_a_frame_sees_it_from_the_targets_own_place(scene, monkeypatch):
+    """The view of an input's own camera at its own time, and what is left of it without the word of that input."""
+    own = jax.tree.map(lambda x: x[2], stage.video().cameras)
+    inputs, frames = target_inputs(*stage.video(), own, 2, system=MINI)
+    maps = jax.tree.map(lambda x: x[frames], scene[1].maps)
+    show = lambda: jax.jit(lambda p: MINI.render(p, MINI.encode(p, inputs, maps), inputs, stage.pixels()).blend)(
+        scene[0]
+    )
+    told = show()
+    monkeypatch.setattr(dynamic, "SHOWN", 0.0)
+    assert float((told - show()).max()) > 0.2
 
 
 def test_excluding_nothing_is_no_exclusion(scene, view):

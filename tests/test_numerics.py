@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.core import Tracer
 from oracles import assert_finite, assert_grads_match, normal
 
 from zestjax.base import numerics
@@ -86,6 +87,25 @@ def test_its_gradient_is_its_slope():
 def test_it_asks_nothing_of_its_arguments(x):
     for wrap in (lambda fn: fn, jax.jit, lambda fn: jax.jit(lambda _: fn(x))):  # the last: a constant of the program
         np.testing.assert_array_equal(wrap(lambda x: numerics.computed_once(lambda x: x + 1, x))(x), x + 1)
+
+
+def test_uncompiled_it_is_the_function_itself():
+    """A `cond` run by itself would be compiled at every call, and kept."""
+    kinds = []
+    numerics.computed_once(lambda x: kinds.append(isinstance(x, Tracer)), jnp.ones(3))
+    jax.jit(lambda x: numerics.computed_once(lambda x: (kinds.append(isinstance(x, Tracer)), x)[1], x))(1.0)
+    assert kinds[0] is False and all(kinds[1:]) and len(kinds) > 1
+
+
+@pytest.mark.parametrize("kind", [jax.sharding.AxisType.Auto, jax.sharding.AxisType.Explicit])
+def test_arrays_may_be_spread_over_devices(kind):
+    mesh, spec = jax.make_mesh((1,), ("a",), axis_types=(kind,)), jax.sharding.PartitionSpec("a")
+    x = jax.device_put(normal(0, 4), jax.sharding.NamedSharding(mesh, spec))
+    once = lambda x: numerics.computed_once(jnp.sin, x)
+    with jax.set_mesh(mesh):
+        found = jax.jit(jax.shard_map(once, mesh=mesh, in_specs=spec, out_specs=spec))(x)
+        np.testing.assert_allclose(found, jnp.sin(x), rtol=1e-6)
+        np.testing.assert_allclose(jax.jit(once)(x), jnp.sin(x), rtol=1e-6)
 
 
 def test_the_compiler_leaves_it_alone():

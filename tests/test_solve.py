@@ -209,6 +209,18 @@ def test_adam_takes_numbers_of_pythons_and_names_what_has_no_gradient():
         solver.init_state({"n": 3})
 
 
+@pytest.mark.parametrize(
+    "grads",
+    [{"a": (3,), "b": (2,)}, {"a": (2,), "c": (3,)}, {"a": (2, 1), "b": (3,)}],
+    ids=["swapped", "named", "turned"],
+)
+def test_adam_refuses_a_gradient_of_another_form(grads):
+    params = {"a": jnp.ones(2), "b": jnp.ones(3)}
+    solver = solve.Adam(learning_rate=0.1)
+    with pytest.raises(ValueError, match="adam: a leaf of params|key"):
+        solver.apply(params, solver.init_state(params), {k: jnp.ones(s) for k, s in grads.items()}, jnp.float32(1))
+
+
 def test_what_an_objective_closes_over_may_be_mapped():
     def fitted(place):
         away = lambda p, batch, _: (jnp.sum((p["x"] - place) ** 2) * batch, {})

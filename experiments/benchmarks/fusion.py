@@ -94,7 +94,7 @@ def main():
     for _ in range(options.turns):
         for side in SIDES:
             found = turn(options, side)
-            print(json.dumps({"side": side, "load": os.getloadavg()[0], **found}), file=sys.stderr, flush=True)
+            print(json.dumps({"side": side, "load": os.getloadavg()[0], **found}), flush=True)
             rows[side] = {what: min(value, rows.setdefault(side, found)[what]) for what, value in found.items()}
     off, on = rows.values()
     print(f"| what | {' | '.join(rows)} | off / on |\n|---|---|---|---|")

@@ -72,7 +72,7 @@ def _scores(report):
 def _clock(report):
     mean, floor = report["mean"], better_floor(report["floors"])
     share = share_of_the_way(mean, report["floors"], report["ceiling"])
-    said = f"{mean['full']['psnr'] - floor:+.2f} dB on the better floor" + (
+    said = f"{mean['full']['psnr'] - floor:+.2f} dB on the best floor" + (
         "" if share is None else f", {100 * share:.0f} % of the way to the ceiling"
     )
     return (

@@ -105,7 +105,7 @@ def better_floor(floors, region="full"):
 
 
 def share_of_the_way(mean, floors, ceiling, region="full"):
-    """Where the model stands between the better floor (0) and the ceiling (1) in a region's PSNR, or None."""
+    """Where the model stands between the best floor (0) and the ceiling (1) in a region's PSNR, or None."""
     low = better_floor(floors, region)
     if low is None or not ceiling or not ceiling.get(region) or not mean.get(region):
         return None

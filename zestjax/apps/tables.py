@@ -33,14 +33,14 @@ def counted(count, what):
 
 
 def headline(report):
-    """PSNR by region against the better floor, and the seconds: one line."""
+    """PSNR by region against the best floor, and the seconds: one line."""
     mean = report["mean"]
     parts = []
     for region in REGIONS:
         floor = better_floor(report["floors"], region)
         if mean.get(region) and floor is not None:
             parts.append(
-                f"{region} {mean[region]['psnr']:.2f} dB ({mean[region]['psnr'] - floor:+.2f} on the better floor)"
+                f"{region} {mean[region]['psnr']:.2f} dB ({mean[region]['psnr'] - floor:+.2f} on the best floor)"
             )
     return f"{report['scene']}: {', '.join(parts)}, {mean['seconds_per_frame']:.2f} s a frame"
 

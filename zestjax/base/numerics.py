@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from zestjax.base.types import Array, Scalar, T
 
@@ -107,12 +108,14 @@ def computed_once(fn: Callable[..., T], *args: Any) -> T:
     if jax.default_backend() != "cpu":
         return fn(*args)
     always = jax.lax.rng_uniform(jnp.float32(0), jnp.float32(1), ()) < 2
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(fn, *args))
-    return jax.lax.cond(always, fn, lambda *_: nothing, *args)
+    if not isinstance(always, Tracer):  # nothing is compiled: every operation is run as it comes, and kept
+        return fn(*args)
+    nothing = lambda *args: jax.tree.map(jnp.zeros_like, fn(*args))  # shaped and placed alike; nothing of `fn` is left
+    return jax.lax.cond(always, fn, nothing, *args)
 
 
 def rounded_once(x: T) -> T:
-    """Arrays that all their readers see alike, to the last bit.
+    """Arrays that all their readers see alike, to the last bit, in a program for the CPU; elsewhere `x` as it is.
 
     What is computed again in two readers may be rounded differently in each, as products and sums are joined here and
     not there. Where a number decides which row of a table is read by one and how far from that row it lies by

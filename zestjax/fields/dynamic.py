@@ -94,7 +94,8 @@ def dynamic_views(samples: ViewSamples, shift: jax.Array, times: jax.Array) -> V
 
     Args:
       samples: `ViewSamples` of the slots.
-      shift: (V, P) pixels of parallax per plane.
+      shift: (V, P) pixels of parallax per plane, of the ray's points, also where the field is asked at points moved
+        away from them.
       times: (V,) frames between the view and the target.
 
     Returns:

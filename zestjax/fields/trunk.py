@@ -85,10 +85,7 @@ def init_view_head(key: jax.Array, n_view: int, n_hidden: int, *, width: int = 1
 
 
 def lifted(params: ViewHead, features: jax.Array) -> list[jax.Array]:
-    """(V, U, P) -> V arrays (width, P) before any activation.
-
-    One product per view, the bias as one more row: the gradients are products too, not slow sums.
-    """
+    """(V, U, P) -> V arrays (width, P) before any activation, one product per view."""
     kernel, bias = params.lift.kernel.T, params.lift.bias[:, None]
     features = lowered(features, kernel)
     return [kernel @ view + lowered(bias, kernel) for view in features]

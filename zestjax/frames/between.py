@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from zestjax.base.types import Array
@@ -124,7 +125,7 @@ def _footage_around(images, seen, time):
     for frame, way in ((time, 0), (time, 1), (time - 1, 0), (time + 1, 1)):
         if first <= frame <= last:
             flow[frame, way], sure[frame, way] = near.flow.flow[frame - first, way], near.flow.sure[frame - first, way]
-    half = seen.half.at[time].set(near.half[time - first])
+    half = jnp.asarray(seen.half).at[time].set(near.half[time - first])
     return Footage(half, VideoFlow(flow, sure))
 
 
