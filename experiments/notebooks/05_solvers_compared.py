@@ -96,7 +96,7 @@ axis.legend(fontsize=8)
 # Per second, not per step: an update with a line search asks for the objective several times. This objective has
 # corners (leaky ReLUs, clipped values, the nearest cell), and it shows. Adam at the higher rate comes lowest, though
 # it rattles, and may end above its lowest. L-BFGS drops fast at first and then stalls at a corner; which one, rounding
-# decides, so that its end differs from run to run (0.0014 to 0.0020 were seen; with the line search that only tracks
+# decides, so that its end differs from run to run (0.0012 to 0.0020 were seen; with the line search that only tracks
 # back, which compiles twice as long and is left out here, it differs more). On smooth problems of few parameters the
 # order is the reverse: see the notebook on poses.
 #
