@@ -63,7 +63,7 @@ def quick() -> dict[str, bool | int]:
     """Compiler options for a program that runs a few times, as a gradient that is checked: `jax.jit(f,
     compiler_options=quick())`.
 
-    The gradient of a whole system's objective compiles in a fifth of the time and takes two to four times as long to
+    The gradient of a whole system's objective compiles in a third of the time and takes two to four times as long to
     run (README, "Compiling"); values differ by roundings. JAX takes options where a program is compiled, not in a
     function that another `jit` or `grad` traces. Empty where the default device is no CPU.
     """

@@ -5,7 +5,7 @@ They take any function over pytrees:
     assert_finite(loss, params)
     assert_grads_match(loss, params)
     print(explain_gradient(lambda p: {"mine": loss(p), "theirs": other(p)}, params))
-    jax.jit(jax.grad(loss), compiler_options=quick())  # compiles in a fifth of the time, for a few calls
+    jax.jit(jax.grad(loss), compiler_options=quick())  # compiles in a third of the time, for a few calls
     check_backend()  # in a suite's conftest.py: does JAX compute what it should on this machine?
 """
 
