@@ -29,11 +29,11 @@ COLUMNS = {
     "run s": ("best", "seconds", "once_s"),
     "temporaries MB": ("temp_mb",),
     "peak MB": ("peak_mb",),
-    "GFLOP": ("gflop", "flops"),
+    "GFLOP": ("flops",),
     "of matmul peak": ("share_of_matmul_peak",),
-    "PyTorch / ours": ("torch_ratio",),
 }
 """What a reader looks for, under the names that the benchmarks give it."""
+LOOPS = "XLA counts the operations of a loop's body once: of blocks of rays and of views GFLOP and shares are too low."
 SAID_ELSEWHERE = ("load", "device", "matmul_gflops")
 
 
@@ -67,7 +67,7 @@ def cells(row):
     """A row's cells: what it is, the columns, and everything else as `name value`."""
     names = {name for given in COLUMNS.values() for name in given}
     first = lambda given: next((row[name] for name in given if row.get(name) is not None), None)
-    scaled = {"GFLOP": 1e-9} if "flops" in row else {}
+    scaled = {"GFLOP": 1e-9}
     shown = []
     for title, given in COLUMNS.items():
         value = first(given)
@@ -83,7 +83,9 @@ def table(about, found):
     rows = [[name, *cells(row)] for name, lines in found.items() for row in lines]
     line = lambda row: "| " + " | ".join(row) + " |"
     machine_is = "\n".join(f"- {name}: {text}" for name, text in about.items())
-    return "\n".join([machine_is, "", line(head), "|" + "---|" * len(head), *(line(row) for row in rows), ""])
+    return "\n".join(
+        [machine_is, "", LOOPS, "", line(head), "|" + "---|" * len(head), *(line(row) for row in rows), ""]
+    )
 
 
 def main():

@@ -2,7 +2,8 @@
 
     python experiments/scale.py [--step-seconds zest=54] [--tflops 67] [--share 0.1 0.3]
 
-A step's operations are read off the program as it is lowered, uncompiled. Seconds on this machine are those given by
+A step's operations are read off the program as it is lowered, uncompiled; XLA counts a loop's body once, and rays are
+computed in blocks, so they are too few, and a GPU's days with them. Seconds on this machine are those given by
 `--step-seconds` (`experiments/benchmarks/model.py --preset paper --system NAME` measures them), else operations over
 the rate that the given ones reach. A GPU's are operations over `--share` of its peak: what `small` reaches of a CPU's
 (0.07 to 0.23) is the only measurement there is, so a range is given. No GPU was at hand: those columns are arithmetic.

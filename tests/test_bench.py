@@ -34,7 +34,7 @@ def test_lines_of_all_benchmarks_are_kept_in_one_file_and_a_failure_is_told(modu
     found = json.loads((tmp_path / "out" / "bench.json").read_text())
     assert found["benchmarks"] == {"bad": [{"what": "half"}], "good": [line]} and "jax" in found["machine"]
     rows = (tmp_path / "out" / "table.md").read_text().splitlines()
-    assert rows[-1] == "| good | tiny view | 2 | 0.25 |  |  | 3 |  |  | more [1, 2] |"
+    assert rows[-1] == "| good | tiny view | 2 | 0.25 |  |  | 3 |  | more [1, 2] |"
     assert "starting" in capfd.readouterr().out
 
 

@@ -3,7 +3,8 @@
     python experiments/benchmarks/model.py [--preset small] [--system zest] [--repeats 5] [--rows 8]
 
 The clip is noise seen by cameras on a line: arithmetic does not depend on what is seen. `--rows` renders only that many
-rows of a view (0: all of it). Compile seconds are apart; peak memory is the process's.
+rows of a view (0: all of it). Compile seconds are apart; peak memory is the process's. XLA counts the operations of a
+loop's body once: of a program in blocks of rays they, and the share of the peak, are too low.
 """
 
 import argparse
