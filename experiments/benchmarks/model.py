@@ -94,16 +94,21 @@ def measure_step(recipe, clip, repeats):
     return {"compile": seconds, **timed(run, repeats), "flops": flops(compiled), "temp_mb": temporary(compiled)}
 
 
-def measure_view(system, clip, repeats, rows):
-    """One view, or its first rows."""
-    params = system.init(jax.random.key(2))
+def inputs_and_maps(params, clip, system):
+    """(`Inputs`, `FrameMaps` or None) of a view of a clip, from its frame 3's camera at time 5."""
     camera = Camera(clip.intrinsics, clip.camera_from_world)
     video = Video(clip.images.astype(np.float32) / 255, camera, clip.near, clip.far)
     prepared = novel_view.prepare(params, video, system=system)
     inputs, frames = target_inputs(
         video.images, camera, clip.near, clip.far, Camera(*(x[3] for x in camera)), 5, system=system
     )
-    maps = None if prepared.maps is None else jax.tree.map(lambda x: x[frames], prepared.maps)
+    return inputs, None if prepared.maps is None else jax.tree.map(lambda x: x[frames], prepared.maps)
+
+
+def measure_view(system, clip, repeats, rows):
+    """One view, or its first rows."""
+    params = system.init(jax.random.key(2))
+    inputs, maps = inputs_and_maps(params, clip, system)
     start = time.perf_counter()
     compiled = novel_view.render_inputs.lower(params, inputs, maps, system=system, rows=rows or None).compile()
     seconds = time.perf_counter() - start

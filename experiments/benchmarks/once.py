@@ -15,18 +15,14 @@ from unittest import mock
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from model import noise_clip
+from model import inputs_and_maps, noise_clip
 
 from zestjax import adam, novel_view
 from zestjax.apps.weights import open_weights
-from zestjax.cameras import Camera
 from zestjax.fields import heads
 from zestjax.systems import fields
-from zestjax.systems.targets import target_inputs
 from zestjax.train import batches
 from zestjax.train.recipes import RECIPES
-from zestjax.video import Video
 
 PLACES = (adam, heads, fields)  # that import it
 
@@ -35,11 +31,7 @@ def calls_of(recipe, clip):
     """{what: (a function to compile, its arguments)}."""
     system, key = recipe.system, jax.random.key
     params = open_weights().params if recipe == RECIPES["small"] else system.init(key(2))
-    cameras = Camera(clip.intrinsics, clip.camera_from_world)
-    video = Video(clip.images.astype(np.float32) / 255, cameras, clip.near, clip.far)
-    target = Camera(*(x[3] for x in cameras))
-    inputs, frames = target_inputs(video.images, cameras, clip.near, clip.far, target, 5, system=system)
-    maps = jax.tree.map(lambda x: x[frames], novel_view.prepare(params, video, system=system).maps)
+    inputs, maps = inputs_and_maps(params, clip, system)
     init, step = recipe.stage("views").trainer(steps=1000)
     batch = batches.batch_from_clip(key(1), batches.prepare_clip(key(0), clip, system), recipe)
     frame = lambda p, i, m: novel_view.render_inputs(p, i, m, system=system).colour
