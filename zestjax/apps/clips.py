@@ -26,7 +26,9 @@ from zestjax.io.reading import read_arrays
 
 ORIGIN = "origin"
 EVIDENCE = "evidence_"
-"""Before the names of the evidence's arrays, which share a dict with the clip's."""
+STAND_IN = "stand_in_"
+"""Before the names of the evidence's arrays, and of the frames that stand in for holes, which share a dict with the
+clip's."""
 
 
 class ClipSpec(NamedTuple):
@@ -52,7 +54,7 @@ def clip_folder(spec, *, root=None):
 def evidence_folder(folder, planes):
     """Where the evidence of a folder's clips lies: by planes and by the code that finds it."""
     parts = ("frames/evidence", "frames/cells", "frames/optical_flow", "frames/assembly", "frames/selection",
-             "planesweep", "resample", "cameras")  # fmt: skip
+             "frames/between", "train/stand_ins", "planesweep", "resample", "cameras")  # fmt: skip
     code = code_digest(*(f"{name}.py" for name in parts))
     return Path(folder) / f"evidence-{planes}-{code}"
 
@@ -130,10 +132,20 @@ def make_clip(spec, folder, index):
         clip, key = clip_from_arrays(_clip_arrays(spec, path, index)), hole_key(spec.seed, index)
         prepared = prepare_clip(key, clip, dataclasses.replace(ZEST, frames=OwnMaps(spec.planes)))
         assert prepared.evidence is not None  # of a system with maps of its frames
-        evidence = {f"{EVIDENCE}{name}": array for name, array in prepared.evidence._asdict().items()}
-        write_clip(found, evidence | {"holes": np.array(prepared.holes, int)}, origin_of(spec, index))
+        write_clip(found, _stored_evidence(prepared), origin_of(spec, index))
     if not path.exists():
         _clip_arrays(spec, path, index)
+
+
+def _stored_evidence(prepared):
+    """Arrays by name of what `train.batches.prepare_clip` adds to a clip."""
+    named = lambda before, arrays: {f"{before}{name}": array for name, array in arrays.items()}
+    arrays = named(EVIDENCE, prepared.evidence._asdict()) | {"holes": np.array(prepared.holes, int)}
+    if prepared.stand_ins is None:
+        return arrays
+    *plain, evidence = prepared.stand_ins
+    arrays |= named(STAND_IN, dict(zip(prepared.stand_ins._fields, plain, strict=False)))
+    return arrays | named(f"{STAND_IN}{EVIDENCE}", evidence._asdict())
 
 
 def _clip_arrays(spec, path, index):

@@ -13,7 +13,7 @@ import jax
 
 import zestjax
 from zestjax.apps.cache import STALE_DAYS, held_clips, remove_stale_clips
-from zestjax.apps.clips import EVIDENCE, ClipSpec, clip_folder, hole_key
+from zestjax.apps.clips import EVIDENCE, STAND_IN, ClipSpec, clip_folder, hole_key
 from zestjax.apps.hosts import is_first, join, run_mesh, run_place
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.own_frames import known_of, own_frame_batches
@@ -37,6 +37,7 @@ from zestjax.train.learn import STAGES, find_fault, stage_weights
 from zestjax.train.mesh import mesh_trainer
 from zestjax.train.recipes import RECIPES, SYSTEMS, recipe_of
 from zestjax.train.settings import with_settings
+from zestjax.train.stand_ins import StandIns
 from zestjax.train.terms import measurable, unmeasured
 from zestjax.train.training import TrainState, batch_key, clip_index, clip_window
 
@@ -268,5 +269,10 @@ def prepared_from_arrays(key, arrays, system):
     clip = clip_from_arrays(arrays)
     if "holes" not in arrays:
         return prepare_clip(key, clip, system)
-    evidence = Evidence(**{name: arrays[EVIDENCE + name] for name in Evidence._fields})
-    return PreparedClip(clip, evidence, tuple(int(i) for i in arrays["holes"]))
+    evidence = lambda before: Evidence(**{name: arrays[before + name] for name in Evidence._fields})
+    stand_ins = None
+    if f"{STAND_IN}times" in arrays:
+        plain = [arrays[STAND_IN + name] for name in StandIns._fields[:-1]]
+        stand_ins = StandIns(*plain, evidence(STAND_IN + EVIDENCE))
+    holes = tuple(int(i) for i in arrays["holes"])
+    return PreparedClip(clip, evidence(EVIDENCE), holes, stand_ins=stand_ins)

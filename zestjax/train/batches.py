@@ -22,9 +22,10 @@ from zestjax.systems.system import System
 from zestjax.systems.targets import target_inputs
 from zestjax.train.measures import Known, Truth
 from zestjax.train.recipes import Recipe
-from zestjax.video import Inputs
+from zestjax.train.stand_ins import StandIns, find_stand_ins, slots_evidence, stand_in_at
+from zestjax.video import Inputs, Video
 
-HOLES = 3
+HOLES = 2  # of a clip's frames: a third of the targets then have no frame of their own time
 FRAMES_PER_CLIP = 4  # of a `FrameBatch`
 
 
@@ -57,17 +58,19 @@ class FrameBatch(NamedTuple):
 class PreparedClip(NamedTuple):
     """A `simulate.clips.Clip`, or `KnownFrames`, with its evidence; holes: frames that the video lacks, targets of the
     strict kind; hidden: frames that serve nothing and are no targets either. targets: frames that are targets and serve
-    all the same, of a system that reads no frames."""
+    all the same, of a system that reads no frames. stand_ins: `StandIns` for holes, or None."""
 
     clip: Clip | KnownFrames
     evidence: Evidence | None
     holes: tuple
     hidden: tuple = ()
     targets: tuple = ()
+    stand_ins: StandIns | None = None
 
 
 def prepare_clip(key: jax.Array, clip: Clip, system: System) -> PreparedClip:
-    """Evidence of a clip, computed once; the frames in `holes` serve no other frame, as if the video lacked them.
+    """Evidence of a clip, computed once; the frames in `holes` serve no other frame, as if the video lacked them. Where
+    others can stand in for them, they do, as where a view is rendered.
 
     Args:
       key: draws the holes.
@@ -78,11 +81,10 @@ def prepare_clip(key: jax.Array, clip: Clip, system: System) -> PreparedClip:
     holes = tuple(int(i) for i in jax.random.choice(key, count, (min(HOLES, count // 5),), replace=False))
     if system.frames is None:
         return PreparedClip(clip, None, holes)
-    cameras = Camera(clip.intrinsics, clip.camera_from_world)
-    evidence = video_evidence(
-        footage(clip.images), cameras, clip.near, clip.far, planes=system.frames.planes, exclude=holes
-    )
-    return PreparedClip(clip, evidence, holes)
+    cameras, seen = Camera(clip.intrinsics, clip.camera_from_world), footage(clip.images)
+    planes, video = system.frames.planes, Video(clip.images, cameras, clip.near, clip.far)
+    evidence = video_evidence(seen, cameras, clip.near, clip.far, planes=planes, exclude=holes)
+    return PreparedClip(clip, evidence, holes, stand_ins=find_stand_ins(video, seen, holes, planes=planes))
 
 
 def clip_from_arrays(arrays: Mapping[str, np.ndarray]) -> Clip:
@@ -129,7 +131,8 @@ def _target_views(clip, holes):
 def batch_from_clip(key: jax.Array, prepared: PreparedClip, recipe: Recipe, *, step: int = 0) -> Batch:
     """One target of a clip: which, and which rays of it, is drawn from `key`.
 
-    A target at the time of a hole has no slot at its own time; a hole is itself a target that no input has seen.
+    A target at the time of a hole has no slot at its own time, or one that stands in; a hole is itself a target that no
+    input has seen.
 
     Args:
       key: random key.
@@ -144,24 +147,38 @@ def batch_from_clip(key: jax.Array, prepared: PreparedClip, recipe: Recipe, *, s
     draw = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
     views = _target_views(clip, (*holes, *prepared.targets))
     kind, index, time = views[draw.integers(len(views))]
-    cameras = Camera(clip.intrinsics, clip.camera_from_world)
     shown = _shown(clip, kind, index)
-    inputs, frames = target_inputs(
-        clip.images,
-        cameras,
-        clip.near,
-        clip.far,
-        shown["camera"],
-        time,
-        system=system,
-        exclude=(*holes, *prepared.hidden),
-    )
-    evidence = None if prepared.evidence is None else jax.tree.map(lambda x: x[frames], prepared.evidence)
+    inputs, evidence, frames = _inputs_of(prepared, shown["camera"], time, system)
     batch = Batch(inputs, evidence, _rays_of(shown, draw, recipe, step))
-    return batch if isinstance(clip, KnownFrames) else batch._replace(**_planes_of(clip, shown, frames, inputs, system))
+    return (
+        batch
+        if isinstance(clip, KnownFrames)
+        else batch._replace(**_planes_of(clip, shown, frames, inputs, system, holes))
+    )
 
 
-def _planes_of(clip, shown, frames, inputs, system):
+def _inputs_of(prepared, camera, time, system):
+    """`Inputs` of a target, their `Evidence` or None, and which frames they hold."""
+    clip = prepared.clip
+    images, cameras = clip.images, Camera(clip.intrinsics, clip.camera_from_world)
+    standing = stand_in_at(prepared.stand_ins, time, images, cameras, system=system)
+    if standing is not None:
+        images, cameras = standing.images, standing.cameras
+    inputs, frames = target_inputs(
+        images, cameras, clip.near, clip.far, camera, time, system=system,
+        exclude=(*prepared.holes, *prepared.hidden), stand_in=standing is not None,
+    )  # fmt: skip
+    if prepared.evidence is None:
+        return inputs, None, frames
+    evidence = jax.tree.map(lambda x: x[frames], prepared.evidence)
+    if standing is not None:
+        count = len(inputs.key.valid)
+        of_slots = slots_evidence(prepared.stand_ins, standing, np.asarray(frames)[count:])
+        evidence = jax.tree.map(lambda key, slots: np.concatenate([key[:count], slots]), evidence, of_slots)
+    return inputs, evidence, frames
+
+
+def _planes_of(clip, shown, frames, inputs, system, holes):
     """Where the volumes' and the frames' surfaces truly are."""
     planes = lambda depth: _cells(_planes(depth, clip, system.space.planes, spacing=system.space.spacing))
     of_frames = _cells(_planes(clip.depth[frames], clip, evidence_planes(system)))
@@ -172,8 +189,14 @@ def _planes_of(clip, shown, frames, inputs, system):
         moving_planes_valid=_cells(shown["moving"]).astype(np.float32),
         frame_planes=of_frames,
         frame_moving=_half_mask(clip.moving[frames], of_frames.shape[1:]),
-        frame_valid=np.concatenate([part.valid for part in (inputs.key, inputs.slots) if part is not None]),
+        frame_valid=_own_valid(inputs, frames, holes),
     )
+
+
+def _own_valid(inputs, frames, holes):
+    """(V,) 1 where a frame is there and its own: of one that stands in for a hole nobody knows the depths."""
+    valid = np.concatenate([part.valid for part in (inputs.key, inputs.slots) if part is not None])
+    return valid * ~np.isin(frames, holes)
 
 
 def evidence_planes(system: System) -> int:

@@ -1,0 +1,106 @@
+"""Training with frames that stand in for those that a clip lacks, as they do where a view is rendered
+(`frames.between`).
+
+N      frames of the clip
+M      times whose frame is stood in for
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from zestjax.cameras import Camera
+from zestjax.frames.assembly import Footage, video_evidence
+from zestjax.frames.between import with_stand_in
+from zestjax.frames.evidence import Evidence
+from zestjax.systems.system import System
+from zestjax.video import Video
+
+REACH = 2  # frames on either side of a time that are kept: as far as `Slots` look by default
+
+
+class StandIns(NamedTuple):
+    """times: (M,) int. images: (M, H, W, 3) uint8. intrinsics: (M, 3, 3). camera_from_world: (M, 4, 4). evidence:
+    `Evidence` (M, 2 REACH + 1, ...) of the frames around each time, the one that stands in among them."""
+
+    times: np.ndarray | np.integer
+    images: np.ndarray
+    intrinsics: np.ndarray
+    camera_from_world: np.ndarray
+    evidence: Evidence
+
+
+class Standing(NamedTuple):
+    """A clip in which one frame stands in for another. images: (N, H, W, 3) uint8. cameras: `Camera` (N, ...). row: of
+    the `StandIns`. time: frame index."""
+
+    images: np.ndarray
+    cameras: Camera
+    row: int
+    time: int
+
+
+def find_stand_ins(video: Video, seen: Footage, holes: Sequence[int], *, planes: int) -> StandIns | None:
+    """Those of a video's holes for which a frame can stand in, and what the frames around them then show.
+
+    Args:
+      video: `Video` on the host, of uint8 images.
+      seen: its `Footage`.
+      holes: frames that serve nothing, and are not read.
+      planes: of the evidence.
+
+    Returns:
+      `StandIns`, or None where there are none.
+    """
+    found = [_stand_in(video, seen, time, holes, planes) for time in holes]
+    found = [one for one in found if one is not None]
+    return jax.tree.map(lambda *rows: np.stack(rows), *found) if found else None
+
+
+def _stand_in(video, seen, time, holes, planes):
+    """A row of `StandIns`, or None."""
+    between = with_stand_in(video, seen, time, exclude=holes)
+    if between is None:
+        return None
+    shown, around = between
+    frames = np.clip(np.arange(time - REACH, time + REACH + 1), 0, len(video.images) - 1)
+    used, place = np.unique(frames, return_inverse=True)
+    evidence = video_evidence(
+        around, shown.cameras, video.near, video.far, planes=planes, frames=used,
+        exclude=[hole for hole in holes if hole != time],
+    )  # fmt: skip
+    pose = {name: np.asarray(leaf)[time] for name, leaf in shown.cameras._asdict().items()}
+    of_all = jax.tree.map(lambda x: x[place], evidence)
+    return StandIns(times=np.int64(time), images=np.asarray(shown.images)[time], evidence=of_all, **pose)
+
+
+def stand_in_at(
+    found: StandIns | None, time: int, images: np.ndarray, cameras: Camera, *, system: System
+) -> Standing | None:
+    """`Standing` for a target's time, or None: nothing stands in there, or the system does not look so far or at all.
+
+    Args:
+      found: `StandIns`, or None.
+      time: of the target.
+      images: (N, H, W, 3) uint8.
+      cameras: `Camera` (N, ...).
+      system: `System`.
+    """
+    offsets = () if system.dynamic is None else getattr(system.dynamic.frames, "offsets", ())
+    if found is None or not np.any(found.times == time) or 0 not in offsets or max(map(abs, offsets)) > REACH:
+        return None
+    row = int(np.argmax(found.times == time))
+    images, leaves = np.array(images), [np.array(leaf) for leaf in cameras]
+    images[time] = found.images[row]
+    for leaf, new in zip(leaves, (found.intrinsics[row], found.camera_from_world[row]), strict=True):
+        leaf[time] = new
+    return Standing(images, Camera(*leaves), row, time)
+
+
+def slots_evidence(found: StandIns, standing: Standing, frames: np.ndarray) -> Evidence:
+    """`Evidence` of slots, by their frames; one too far off, which only fills a place, has that of the time itself."""
+    offsets = np.asarray(frames) - standing.time
+    places = np.where(np.abs(offsets) <= REACH, offsets, 0) + REACH
+    return jax.tree.map(lambda x: x[standing.row][places], found.evidence)
