@@ -272,7 +272,7 @@ def prepared_from_arrays(key, arrays, system):
     evidence = lambda before: Evidence(**{name: arrays[before + name] for name in Evidence._fields})
     stand_ins = None
     if f"{STAND_IN}times" in arrays:
-        plain = [arrays[STAND_IN + name] for name in StandIns._fields[:-1]]
-        stand_ins = StandIns(*plain, evidence(STAND_IN + EVIDENCE))
+        plain = {name: arrays[STAND_IN + name] for name in StandIns._fields[:-1]}
+        stand_ins = StandIns(evidence=evidence(STAND_IN + EVIDENCE), **plain)
     holes = tuple(int(i) for i in arrays["holes"])
     return PreparedClip(clip, evidence(EVIDENCE), holes, stand_ins=stand_ins)
