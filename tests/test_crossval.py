@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -99,8 +100,9 @@ def test_by_default_the_scenes_are_zest_benchs(tmp_path):
 
 
 def a_scene(folder):
-    """A folder that is taken for a scene."""
-    write_image(folder / "images/00000.png", np.zeros((16, 16, 3), np.float32))
+    """A folder that is taken for a scene, with a picture of its own."""
+    painted = np.random.default_rng(list(str(folder).encode())).random((16, 16, 3))
+    write_image(folder / "images/00000.png", painted.astype(np.float32))
     np.save(folder / "poses_bounds.npy", np.zeros((1, 17)))
 
 
@@ -129,6 +131,15 @@ def test_a_link_to_a_scene_is_that_scene(tmp_path, capsys):
     (tmp_path / "link").symlink_to(tmp_path / "scene")
     given = [str(tmp_path / name) for name in ("scene", "link")]
     refused(capsys, run(tmp_path / "out", "--scenes", *given), f"{tmp_path}/scene is given twice")
+
+
+def test_a_copy_of_a_scene_is_that_scene(tmp_path, capsys):
+    for name in ("first", "other"):
+        a_scene(tmp_path / name)
+    shutil.copytree(tmp_path / "first", tmp_path / "copy")
+    (tmp_path / "copy/images/00000.png").rename(tmp_path / "copy/images/img_a.png")
+    given = [str(tmp_path / name) for name in ("other", "first", "copy")]
+    refused(capsys, run(tmp_path / "out", "--scenes", *given), f"{tmp_path}/copy has the pictures of {tmp_path}/first")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from zestjax.apps.results import write_record
-from zestjax.apps.scenes import place_of
+from zestjax.apps.scenes import place_of, same_pictures
 from zestjax.apps.train import run_name
 from zestjax.apps.weights import shipped_weights
 from zestjax.base.checks import check_option
@@ -183,11 +183,17 @@ def scenes_of(names):
     the Dynamic Scenes data these are the authors' nine, or those of them that are there.
 
     Raises:
-      ValueError: no such scene, or one twice.
+      ValueError: no such scene, or one twice, also under another name.
     """
     found = [place for name in names for place in _scenes_of(str(name))]
     if twice := _twice(found):
         raise ValueError(f"crossval: the scene {twice} is given twice: it would be learned from and held out at once.")
+    if copies := same_pictures([place for place in found if not place.startswith("bench:")]):
+        first, second = copies
+        raise ValueError(
+            f"crossval: {second} has the pictures of {first}, which would be learned from and held out at once; give one "
+            "of them."
+        )
     return tuple(found)
 
 

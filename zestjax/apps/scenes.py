@@ -14,6 +14,7 @@ from zestjax.base.checks import check_option
 from zestjax.cameras import project, unproject
 from zestjax.io.files import resolved
 from zestjax.io.layouts import select
+from zestjax.io.pictures import SUFFIXES
 from zestjax.io.scenes import FIXED_VIEW_FRAMES, PROTOCOLS, Scene, Target, load_scene
 from zestjax.simulate.bench import BENCH
 
@@ -79,6 +80,28 @@ def _tell_enlarged(name, scene):
 def place_of(name):
     """Where a scene lies, for people: a run is compared by `digest`."""
     return str(name) if str(name).startswith("bench:") else str(resolved(name))
+
+
+def same_pictures(folders):
+    """Two of these folders that hold the same pictures, whatever they and the pictures are called, or None."""
+    sizes = {folder: _pictures(folder) for folder in folders}
+    alike = lambda folder: sorted(size for size, _ in sizes[folder])
+    for i, second in enumerate(folders):
+        for first in folders[:i]:
+            if sizes[first] and alike(first) == alike(second) and _contents(sizes[first]) == _contents(sizes[second]):
+                return first, second
+    return None
+
+
+def _pictures(folder):
+    """[(bytes, path)] of the pictures anywhere in a folder."""
+    found = (path for path in Path(folder).rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    return [(path.stat().st_size, path) for path in found]
+
+
+def _contents(pictures):
+    """What tells pictures apart, in an order that their names do not change."""
+    return sorted(hashlib.sha256(path.read_bytes()).hexdigest() for _, path in pictures)
 
 
 def digest(video):
