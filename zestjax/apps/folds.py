@@ -191,8 +191,8 @@ def scenes_of(names):
     if copies := same_pictures([place for place in found if not place.startswith("bench:")]):
         first, second = copies
         raise ValueError(
-            f"crossval: {second} has the pictures of {first}, which would be learned from and held out at once; give one "
-            "of them."
+            f"crossval: {second} has the pictures of {first}: they would be learned from and held out at once; "
+            "give one of them."
         )
     return tuple(found)
 
