@@ -98,7 +98,7 @@ def score_scene(view_of, opened, options, out):
     given = set() if opened.ceiling is None else {"ceiling"}
     planned = [{"file": picture_name(target)} for target in scene.targets if options.pictures]
     results.begin(out / "metrics.json", picture_names, {"scene": scene.name, "unfinished": True, "targets": planned})
-    for target in progress(scene.targets, scene.name, quiet=options.quiet):
+    for target in progress(scene.targets, scene.name, quiet=options.quiet, unit="frame"):
         shown = out if options.pictures else None
         rows.append(evaluate_target(view_of, scene, target, opened.ceiling, shown, lpips))
         given |= {truth for truth in ("dynamic", "depth", "flow") if getattr(target, truth) is not None}

@@ -79,7 +79,13 @@ def finetune(options):
     explain = functools.partial(find_fault, objective)
     params = jax.tree.map(jnp.array, model.trained)  # copies: the step donates
     loop = LoopOptions(
-        options.out, options.steps, options.budget, options.resume, CHECKPOINT_SECONDS, quiet=options.quiet
+        options.out,
+        options.steps,
+        options.budget,
+        options.resume,
+        CHECKPOINT_SECONDS,
+        quiet=options.quiet,
+        label="finetune",
     )
     metadata = model.metadata | {
         "recipe": to_stored(recipe), "seed": options.seed, "start": run_name(model.path),

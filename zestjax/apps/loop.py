@@ -18,9 +18,11 @@ from tqdm import tqdm
 from zestjax.apps import run_folder
 from zestjax.apps.hosts import anywhere, begun_by_first
 from zestjax.apps.log import Recorder, draw_curve, read_log
+from zestjax.apps.progress import Estimate
 from zestjax.io.files import append_bytes
 from zestjax.train.training import TrainState, training_steps
 
+STEPS_TOLD = 8  # after which the steps' time is told: they differ by what their batches wait for
 MOST_FAULTS = 5  # explained in one call: each costs as much as a step
 
 
@@ -30,6 +32,7 @@ class LoopOptions:
 
     out: folder. steps: int, total. seconds: of stepping, the first step (which compiles) left out; None: no limit.
     resume: continue from the folder's newest checkpoint. checkpoint_seconds, log_steps: intervals. quiet: no progress.
+    label: what the estimate of all its steps calls it; where `seconds` end it that is known.
     """
 
     out: Path
@@ -39,6 +42,7 @@ class LoopOptions:
     checkpoint_seconds: float = 300.0
     log_steps: int = 10
     quiet: bool = False
+    label: str = "train"
 
 
 class LoopResult(NamedTuple):
@@ -97,6 +101,8 @@ def _run(step_fn, begun, batch_at, options, metadata, explain):
     out, state, first = Path(options.out), begun.state, begun.state.step
     recorder, clock = Recorder(out / "log.jsonl", options.log_steps), _Clock(begun.seconds, options)
     faults, asked = _Faults(out, state, explain), False
+    untold = options.quiet or options.seconds is not None
+    estimate = Estimate(options.label, "step", after=STEPS_TOLD, quiet=untold)
     with _StopOnSignal() as stop, _bar(first, options) as bar:
         try:
             for state, info in training_steps(step_fn, begun.state, batch_at, steps=options.steps):
@@ -104,6 +110,7 @@ def _run(step_fn, begun, batch_at, options, metadata, explain):
                 recorder.add(state.step, info, clock)
                 faults.see(state, batch_at)
                 _show(bar, recorder, clock)
+                estimate.tick(options.steps - state.step)
                 asked, over = anywhere(stop.asked, clock.over())
                 done = asked or over or state.step == options.steps
                 if done or clock.checkpoint_due():

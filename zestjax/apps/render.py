@@ -103,7 +103,7 @@ def render_path(model, scene, path, *, budget=None, quiet=False):
         check_target(scene.name, scene.video, camera_at(path, index))
     view_of, factors = _within(model, scene.video, path, budget)
     view_at = lambda index: view_of(resized(camera_at(path, index), *factors), int(path.times[index]), ())
-    views = (view_at(index) for index in progress(range(len(path.times)), "render", quiet=quiet))
+    views = (view_at(index) for index in progress(range(len(path.times)), "render", quiet=quiet, unit="frame"))
 
     def timing(seconds):
         each = float(np.median(seconds))  # the first one's compiling is not in it, if there are three
