@@ -7,7 +7,7 @@ exclude  frames that must serve nothing, because they are what is to be predicte
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from zestjax.cameras import Camera, project
 from zestjax.frames.analysis import FrameMaps
 from zestjax.frames.assembly import Footage, dequantised, footage, video_evidence
 from zestjax.frames.between import with_stand_in
+from zestjax.frames.exposure import Exposure, evened, exposed_as_target
 from zestjax.frames.inputs import check_exclude, check_inputs, check_view
 from zestjax.rays import pixel_grid
 from zestjax.systems.system import Params, System
@@ -32,11 +33,12 @@ BLOCK_POINTS = 2**16  # and at most so many samples, unless a ray has more: the 
 
 class Prepared(NamedTuple):
     """A scene's cache. video: `Video` on the host. footage: `assembly.Footage`, and maps: `FrameMaps` of every frame;
-    None in a system that asks nothing of single frames."""
+    None in a system that asks nothing of single frames. exposure: `Exposure`, or None in a system that does not ask."""
 
     video: Video
     footage: Footage | None
     maps: FrameMaps | None
+    exposure: Exposure | None = None
 
 
 class View(NamedTuple):
@@ -90,10 +92,14 @@ def prepare(params: Params, video: Video, *, system: System, exclude: Sequence[i
     video = check_inputs("novel_view.prepare", video, quantised=True)
     exclude = check_exclude("novel_view.prepare", len(video.images), exclude)
     check_params("novel_view.prepare", params, system)
-    if system.frames is None:
+    if system.frames is None and system.exposure is None:
         return Prepared(video, None, None)
     seen = footage(video.images)
-    return Prepared(video, seen, _frame_maps(params, seen, video, system, exclude=exclude))
+    exposure = None if system.exposure is None else system.exposure(seen, exclude=exclude)
+    if system.frames is None:
+        return Prepared(video, seen, None, exposure)
+    maps = _frame_maps(params, evened(seen, exposure), video, system, exclude=exclude)
+    return Prepared(video, seen, maps, exposure)
 
 
 @functools.lru_cache(maxsize=64)
@@ -156,6 +162,9 @@ def render_view(
     if maps is None and system.frames is not None:
         raise ValueError(f"{where}: `prepared` has no maps of its frames; prepare the video with the same `system`.")
     time, exclude = check_view(where, video, camera, time, exclude=exclude)
+    if exclude and prepared.footage is not None:
+        check_known(where, prepared=prepared)
+        prepared = prepared._replace(exposure=_exposure_without(prepared, exclude, system))
     between = _stand_in(prepared, time, exclude, system)
     if between is not None:
         inputs, maps = _inputs_with(between, params, prepared, camera, time, system=system, exclude=exclude)
@@ -166,11 +175,19 @@ def render_view(
     if system.frames is None:
         maps = None
     elif exclude:
-        check_known(where, prepared=prepared)
-        maps = _maps_without(params, prepared.footage, video, system, frames, exclude)
+        seen: Any = prepared.footage
+        maps = _maps_without(params, evened(seen, prepared.exposure), video, system, frames, exclude)
     else:
         maps = jax.tree.map(lambda x: x[frames], maps)
-    return render_inputs(params, inputs, maps, system=system)
+    return render_inputs(params, exposed_as_target(inputs, frames, prepared.exposure), maps, system=system)
+
+
+def _exposure_without(prepared, exclude, system):
+    """`Exposure` without what the frames to be excluded say of it."""
+    if system.exposure is None:
+        return None
+    with jax.ensure_compile_time_eval():  # the video is known also where a camera is traced
+        return system.exposure(prepared.footage, exclude=exclude, known=prepared.exposure)
 
 
 def _stand_in(prepared, time, exclude, system):
@@ -191,9 +208,12 @@ def _inputs_with(between, params, prepared, camera, time, *, system, exclude):
         video.images, video.cameras, video.near, video.far, camera, time, system=system, exclude=exclude, stand_in=True
     )
     count, missing = len(inputs.key.valid), tuple(i for i in exclude if i != time)
-    of_key = _maps_without(params, prepared.footage, prepared.video, system, frames[:count], exclude)
-    of_slots = _maps_without(params, seen, video, system, frames[count:], missing)
-    return inputs, jax.tree.map(lambda *parts: jnp.concatenate(parts), of_key, of_slots)
+    with jax.ensure_compile_time_eval():  # as above
+        first, second = (evened(x, prepared.exposure) for x in (prepared.footage, seen))
+    of_key = _maps_without(params, first, prepared.video, system, frames[:count], exclude)
+    of_slots = _maps_without(params, second, video, system, frames[count:], missing)
+    maps = jax.tree.map(lambda *parts: jnp.concatenate(parts), of_key, of_slots)
+    return exposed_as_target(inputs, frames, prepared.exposure), maps
 
 
 def _maps_without(params, seen, video, system, frames, exclude):

@@ -26,9 +26,9 @@ from zestjax.io.reading import read_arrays
 
 ORIGIN = "origin"
 EVIDENCE = "evidence_"
-STAND_IN = "stand_in_"
-"""Before the names of the evidence's arrays, and of the frames that stand in for holes, which share a dict with the
-clip's."""
+STAND_IN, EXPOSURE = "stand_in_", "exposure_"
+"""Before the names of the evidence's arrays, of the frames that stand in for holes, and of the exposures, which share a
+dict with the clip's."""
 
 
 class ClipSpec(NamedTuple):
@@ -54,7 +54,7 @@ def clip_folder(spec, *, root=None):
 def evidence_folder(folder, planes):
     """Where the evidence of a folder's clips lies: by planes and by the code that finds it."""
     parts = ("frames/evidence", "frames/cells", "frames/optical_flow", "frames/assembly", "frames/selection",
-             "frames/between", "train/stand_ins", "planesweep", "resample", "cameras")  # fmt: skip
+             "frames/between", "frames/exposure", "train/stand_ins", "planesweep", "resample", "cameras")  # fmt: skip
     code = code_digest(*(f"{name}.py" for name in parts))
     return Path(folder) / f"evidence-{planes}-{code}"
 
@@ -141,6 +141,8 @@ def _stored_evidence(prepared):
     """Arrays by name of what `train.batches.prepare_clip` adds to a clip."""
     named = lambda before, arrays: {f"{before}{name}": array for name, array in arrays.items()}
     arrays = named(EVIDENCE, prepared.evidence._asdict()) | {"holes": np.array(prepared.holes, int)}
+    if prepared.exposure is not None:
+        arrays |= named(EXPOSURE, {name: x for name, x in prepared.exposure._asdict().items() if x is not None})
     if prepared.stand_ins is None:
         return arrays
     *plain, evidence = prepared.stand_ins

@@ -9,6 +9,7 @@ import numpy as np
 
 from zestjax.cameras import Camera
 from zestjax.frames.assembly import footage, video_evidence
+from zestjax.frames.exposure import evened
 from zestjax.frames.known import KnownFrames, known_frames
 from zestjax.io.scenes import Scene
 from zestjax.systems.fields import reads_frames
@@ -40,6 +41,7 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
     """
     usable = np.array([i for i in range(len(known.images)) if i not in set(exclude)])
     cameras, maps = Camera(known.intrinsics, known.camera_from_world), recipe.system.frames
+    gains = recipe.system.exposure
     seen = None if maps is None else footage(known.images)
 
     @functools.lru_cache(maxsize=16)
@@ -48,12 +50,14 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
         rounds, place = divmod(group * size, len(usable))
         order = np.random.default_rng([seed, rounds]).permutation(usable)
         holes = tuple(int(i) for i in np.roll(order, -place)[:size])
-        evidence = None
+        evidence = exposure = None
         if maps is not None and seen is not None:
+            missing = (*holes, *exclude)
+            exposure = None if gains is None else gains(seen, exclude=missing)
             evidence = video_evidence(
-                seen, cameras, known.near, known.far, planes=maps.planes, exclude=(*holes, *exclude)
+                evened(seen, exposure), cameras, known.near, known.far, planes=maps.planes, exclude=missing
             )
-        return PreparedClip(known, evidence, holes, tuple(exclude))
+        return PreparedClip(known, evidence, holes, tuple(exclude), exposure=exposure)
 
     reading = any(map(reads_frames, (recipe.system.static, recipe.system.dynamic)))
     by_heart = PreparedClip(known, None, (), tuple(exclude), tuple(map(int, usable)))

@@ -13,7 +13,7 @@ import jax
 
 import zestjax
 from zestjax.apps.cache import STALE_DAYS, held_clips, remove_stale_clips
-from zestjax.apps.clips import EVIDENCE, STAND_IN, ClipSpec, clip_folder, hole_key
+from zestjax.apps.clips import EVIDENCE, EXPOSURE, STAND_IN, ClipSpec, clip_folder, hole_key
 from zestjax.apps.hosts import is_first, join, run_mesh, run_place
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.own_frames import known_of, own_frame_batches
@@ -24,6 +24,7 @@ from zestjax.apps.weights import arithmetic, load_params
 from zestjax.base.checks import check_option
 from zestjax.base.parts import to_stored
 from zestjax.frames.evidence import Evidence
+from zestjax.frames.exposure import Exposure
 from zestjax.frames.known import answers_of, shared
 from zestjax.train.batches import (
     PreparedClip,
@@ -275,4 +276,6 @@ def prepared_from_arrays(key, arrays, system):
         plain = {name: arrays[STAND_IN + name] for name in StandIns._fields[:-1]}
         stand_ins = StandIns(evidence=evidence(STAND_IN + EVIDENCE), **plain)
     holes = tuple(int(i) for i in arrays["holes"])
-    return PreparedClip(clip, evidence(EVIDENCE), holes, stand_ins=stand_ins)
+    links, gains = (arrays.get(EXPOSURE + name) for name in Exposure._fields)
+    exposure = None if links is None else Exposure(links, gains)
+    return PreparedClip(clip, evidence(EVIDENCE), holes, stand_ins=stand_ins, exposure=exposure)

@@ -9,6 +9,7 @@ from typing import Any
 
 from zestjax.fields.heads import Blend, Direct
 from zestjax.frames.analysis import OwnMaps
+from zestjax.frames.exposure import Gains
 from zestjax.frames.selection import KeyFrames, Slots
 from zestjax.systems.fields import Dynamic, Static, reads_frames
 from zestjax.systems.mixes import Density, Opacity
@@ -19,10 +20,10 @@ from zestjax.systems.system import Space, System
 NSFF_REACH = 0.2  # frustum units: from one frame to the next nothing crosses more of a scene
 SAMPLES = 8  # of a ray that nothing guides, in the ablation: about as many as a guided one has
 
-ZEST = System(Space(32), Static(), Dynamic(), Guided(), Opacity(), OwnMaps(32))
+ZEST = System(Space(32), Static(), Dynamic(), Guided(), Opacity(), OwnMaps(32), exposure=Gains())
 
 _SMALL: dict[str, Any] = dict(width=16, depth=2, volume=Swept(widths=(4, 8)))
-TINY = System(Space(8), Static(KeyFrames(4), **_SMALL), Dynamic(**_SMALL), frames=OwnMaps(8, (8, 12)))
+TINY = System(Space(8), Static(KeyFrames(4), **_SMALL), Dynamic(**_SMALL), frames=OwnMaps(8, (8, 12)), exposure=Gains())
 
 
 def published(
@@ -100,6 +101,6 @@ ABLATED = {
 """What each system of the paper's ablation makes of the whole one."""
 PARTS = (
     System, Space, Static, Dynamic, KeyFrames, Slots, Swept, OwnDepths, Pyramid, OwnMaps, Blend, Direct, Guided, Even,
-    Opacity, Density,
+    Opacity, Density, Gains,
 )  # fmt: skip
 """The parts that a file may name."""

@@ -18,6 +18,7 @@ from zestjax.depth import expected_depth
 from zestjax.fields.dynamic import DynamicSample
 from zestjax.frames.analysis import AnalysisParams, FrameMaps, OwnMaps
 from zestjax.frames.cells import SIDE, cells_of
+from zestjax.frames.exposure import Gains
 from zestjax.frustum import Frustum
 from zestjax.planesweep import plane_depths
 from zestjax.rays import SPACINGS
@@ -112,7 +113,8 @@ class System:
 
     space: what a target is described in. static, dynamic: the two fields, dynamic None where nothing moves. sampler:
     where rays are sampled. mix: how the fields share a ray. frames: what every frame is asked about itself, or None.
-    precision: of the networks (see `precision`); geometry beside `bfloat16` networks stays float32.
+    precision: of the networks (see `precision`); geometry beside `bfloat16` networks stays float32. exposure: by what
+    the frames' exposures are made one where they drift, or None: they are taken as they are.
     """
 
     space: Space = Space()
@@ -122,6 +124,7 @@ class System:
     mix: Mix = Opacity()
     frames: OwnMaps | None = OwnMaps()
     precision: str = "float32"
+    exposure: Gains | None = None
 
     def __post_init__(self):
         check_option("System", precision=(self.precision, PRECISIONS))

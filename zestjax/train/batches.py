@@ -16,6 +16,7 @@ from zestjax.cameras import Camera
 from zestjax.frames.assembly import footage, video_evidence
 from zestjax.frames.cells import cells_of
 from zestjax.frames.evidence import Evidence
+from zestjax.frames.exposure import Exposure, evened, exposed_as_target
 from zestjax.frames.known import KnownFrames
 from zestjax.simulate.clips import Clip
 from zestjax.systems.system import System
@@ -58,7 +59,8 @@ class FrameBatch(NamedTuple):
 class PreparedClip(NamedTuple):
     """A `simulate.clips.Clip`, or `KnownFrames`, with its evidence; holes: frames that the video lacks, targets of the
     strict kind; hidden: frames that serve nothing and are no targets either. targets: frames that are targets and serve
-    all the same, of a system that reads no frames. stand_ins: `StandIns` for holes, or None."""
+    all the same, of a system that reads no frames. stand_ins: `StandIns` for holes, or None. exposure: `Exposure`, or
+    None."""
 
     clip: Clip | KnownFrames
     evidence: Evidence | None
@@ -66,6 +68,7 @@ class PreparedClip(NamedTuple):
     hidden: tuple = ()
     targets: tuple = ()
     stand_ins: StandIns | None = None
+    exposure: Exposure | None = None
 
 
 def prepare_clip(key: jax.Array, clip: Clip, system: System) -> PreparedClip:
@@ -83,8 +86,11 @@ def prepare_clip(key: jax.Array, clip: Clip, system: System) -> PreparedClip:
         return PreparedClip(clip, None, holes)
     cameras, seen = Camera(clip.intrinsics, clip.camera_from_world), footage(clip.images)
     planes, video = system.frames.planes, Video(clip.images, cameras, clip.near, clip.far)
-    evidence = video_evidence(seen, cameras, clip.near, clip.far, planes=planes, exclude=holes)
-    return PreparedClip(clip, evidence, holes, stand_ins=find_stand_ins(video, seen, holes, planes=planes))
+    exposure = None if system.exposure is None else system.exposure(seen, exclude=holes)
+    even = evened(seen, exposure)
+    evidence = video_evidence(even, cameras, clip.near, clip.far, planes=planes, exclude=holes)
+    stand_ins = find_stand_ins(video, seen, holes, planes=planes, exposure=exposure)
+    return PreparedClip(clip, evidence, holes, stand_ins=stand_ins, exposure=exposure)
 
 
 def clip_from_arrays(arrays: Mapping[str, np.ndarray]) -> Clip:
@@ -168,6 +174,7 @@ def _inputs_of(prepared, camera, time, system):
         images, cameras, clip.near, clip.far, camera, time, system=system,
         exclude=(*prepared.holes, *prepared.hidden), stand_in=standing is not None,
     )  # fmt: skip
+    inputs = exposed_as_target(inputs, frames, prepared.exposure)
     if prepared.evidence is None:
         return inputs, None, frames
     evidence = jax.tree.map(lambda x: x[frames], prepared.evidence)

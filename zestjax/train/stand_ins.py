@@ -15,6 +15,7 @@ from zestjax.cameras import Camera
 from zestjax.frames.assembly import Footage, video_evidence
 from zestjax.frames.between import with_stand_in
 from zestjax.frames.evidence import Evidence
+from zestjax.frames.exposure import Exposure, evened
 from zestjax.systems.system import System
 from zestjax.video import Video
 
@@ -42,7 +43,9 @@ class Standing(NamedTuple):
     time: int
 
 
-def find_stand_ins(video: Video, seen: Footage, holes: Sequence[int], *, planes: int) -> StandIns | None:
+def find_stand_ins(
+    video: Video, seen: Footage, holes: Sequence[int], *, planes: int, exposure: Exposure | None = None
+) -> StandIns | None:
     """Those of a video's holes for which a frame can stand in, and what the frames around them then show.
 
     Args:
@@ -50,16 +53,17 @@ def find_stand_ins(video: Video, seen: Footage, holes: Sequence[int], *, planes:
       seen: its `Footage`.
       holes: frames that serve nothing, and are not read.
       planes: of the evidence.
+      exposure: `Exposure` without the holes, or None.
 
     Returns:
       `StandIns`, or None where there are none.
     """
-    found = [_stand_in(video, seen, time, holes, planes) for time in holes]
+    found = [_stand_in(video, seen, time, holes, planes, exposure) for time in holes]
     found = [one for one in found if one is not None]
     return jax.tree.map(lambda *rows: np.stack(rows), *found) if found else None
 
 
-def _stand_in(video, seen, time, holes, planes):
+def _stand_in(video, seen, time, holes, planes, exposure):
     """A row of `StandIns`, or None."""
     between = with_stand_in(video, seen, time, exclude=holes)
     if between is None:
@@ -68,7 +72,7 @@ def _stand_in(video, seen, time, holes, planes):
     frames = np.clip(np.arange(time - REACH, time + REACH + 1), 0, len(video.images) - 1)
     used, place = np.unique(frames, return_inverse=True)
     evidence = video_evidence(
-        around, shown.cameras, video.near, video.far, planes=planes, frames=used,
+        evened(around, exposure), shown.cameras, video.near, video.far, planes=planes, frames=used,
         exclude=[hole for hole in holes if hole != time],
     )  # fmt: skip
     pose = {name: np.asarray(leaf)[time] for name, leaf in shown.cameras._asdict().items()}
