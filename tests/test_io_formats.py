@@ -8,6 +8,8 @@ import base64
 import json
 import os
 import shutil
+import subprocess
+import sys
 import warnings
 import zlib
 
@@ -503,6 +505,8 @@ FAULTS = {
         instant_ngp, replaced("transforms.json", "./images/0009.png", "..\\\\0009.png"), "0009.png"),
     "a frame twice": (instant_ngp, replaced("transforms.json", "0009", "0010"), "lists 0010.png twice"),
     "a missing frame": (instant_ngp, lambda f: (f / "images/0010.png").unlink(), "0010.png: is missing"),
+    "several folders without times": (instant_ngp, lambda f: ((f / "more").mkdir(), shutil.move(
+        f / "images/0009.png", f / "more"), replaced("transforms.json", "images/0009", "more/0009")(f)), "no order"),
     "a scaled pose": (instant_ngp, replaced("transforms.json", "[0, 0, 1, 2]", "[0, 0, 3, 2]"), "is not rigid"),
     "one time for two": (instant_ngp, replaced("transforms.json", '"sharpness"', '"time": 3, "sharpness"'),
                          "both of time 3; several cameras"),
@@ -534,6 +538,37 @@ def test_bad_input_is_one_line_that_names_the_file(tmp_path, fault):
         warnings.simplefilter("ignore", FileWarning)
         load(folder)
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_masks_of_transforms_are_left_out_with_a_word(tmp_path):
+    folder = instant_ngp(tmp_path)
+    replaced("transforms.json", '"sharpness"', '"mask_path": "masks/a.png", "sharpness"')(folder)
+    with pytest.warns(FileWarning, match="names files by mask_path, which are not read"):
+        load(folder)
+
+
+OPENS = """
+import sys
+from zestjax.io.scenes import load_scene
+video = load_scene(sys.argv[1], protocol="strict", height=288).video
+print([int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM")][0], *video.images.shape)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is counted by Linux")
+def test_300_frames_of_1080p_open_in_less_than_a_gigabyte(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (1080, 1920, 3)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "0.jpg"), cv2.GaussianBlur(noise, (0, 0), 2))
+    rows = ["file,time,width,height,fx,fy,cx,cy,qw,qx,qy,qz,tx,ty,tz,near,far"]
+    for i in range(300):
+        if i:
+            os.link(tmp_path / "0.jpg", tmp_path / f"{i}.jpg")
+        rows.append(f"{i}.jpg,{i},1920,1080,1600,1600,959.5,539.5,1,0,0,0,{0.01 * i},0,0,2,50")
+    (tmp_path / "cameras.csv").write_text("\n".join(rows))
+    done = subprocess.run([sys.executable, "-c", OPENS, tmp_path], capture_output=True, text=True, check=True)
+    kilobytes, *shape = map(int, done.stdout.split())
+    assert shape == [300, 288, 512, 3] and kilobytes < 1e6
 
 
 def test_films_of_several_cameras_are_refused_with_what_to_do(tmp_path):

@@ -14,6 +14,7 @@ Depth bounds are those of the points that lie in each picture: the 5th and 95th 
 """
 
 import dataclasses
+import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -124,7 +125,7 @@ def _pictures_of(path, images, source):
     """{file: name} of a model's pictures, in the first folder of pictures that has one of them."""
     for folder in _picture_folders(path):
         files = {file_inside(folder, name, source): name for name in images}
-        if any(file.exists() for file in files):
+        if any(os.path.exists(file) for file in files):
             return files
     raise ValueError(f"{source}: none of its pictures ({', '.join(sorted(images)[:SHOWN])[:200]}) is in {path}/images.")
 

@@ -216,6 +216,8 @@ def _camera(kind, width, height, parameters):
 
 
 def _image(name, camera, pose):
+    if len(pose) != 7:
+        raise ValueError(f"the pose of {name[:80]!r} has {len(pose)} numbers, expected 7")
     if not np.isfinite(pose).all() or not np.any(pose[:4]):
         raise ValueError(f"the pose of {name[:80]!r} is {pose}: its quaternion is no rotation, or it is not finite")
     return StoredImage(name, camera, np.array(pose[:4]), np.array(pose[4:]))

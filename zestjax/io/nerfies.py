@@ -16,6 +16,7 @@ along rays: a depth can be a little less.
 """
 
 import json
+import os
 import re
 import warnings
 from collections.abc import Iterable, Sequence
@@ -148,7 +149,7 @@ def _posed(path, rgb, name, world, place):
         pose = rigid(rotation, -rotation @ position)
     files = [file_inside(rgb, f"{name}{suffix}", path / MARKER) for suffix in SUFFIXES]
     return Posed(
-        next((file for file in files if file.exists()), files[0]),
+        next((file for file in files if os.path.exists(file)), files[0]),
         (int(size[1]), int(size[0])),
         intrinsics_of(focal, fy, cx, cy, skew=optional("skew", 0.0), centre=0.5),
         pose,

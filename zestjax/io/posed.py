@@ -76,12 +76,7 @@ def record_of(
     size = _one_size(source, everything)
     known: dict[bytes, Lens | None] = {}
     lenses = [_lens_of(source, shot, known) for shot in everything]
-    pinholes = [
-        shot.intrinsics if lens is None else lens.pinhole for shot, lens in zip(everything, lenses, strict=True)
-    ]
-    poses = np.stack([shot.camera_from_world for shot in everything])
-    cameras = Camera(as_float32(source, np.stack(pinholes)), as_float32(source, poses))
-    check_camera(str(source), cameras)
+    cameras = _pinholes(source, everything, lenses)
     count = len(posed)
     others = [
         HeldOut(shot.time, shot.camera_name, select(cameras, count + i), shot.image, lens=lenses[count + i])
@@ -210,7 +205,7 @@ def _check_pictures(source, everything):
         if shot.image in seen:
             raise ValueError(f"{source}: lists {shot.image.name} twice; keep one of its cameras.")
         seen.add(shot.image)
-        if not shot.image.exists():
+        if not os.path.exists(shot.image):  # Path's raises where a folder may not be entered
             raise ValueError(
                 f"{shot.image}: is missing, but {source.name} has its camera; put it there, or take the camera out."
             )
@@ -245,6 +240,15 @@ def _check_numbers(where, shot, size):
             f"{where} looks at pixel ({k[0, 2]:g}, {k[1, 2]:g}), column and row, outside pictures of "
             f"{size[0]}x{size[1]} (HxW); give intrinsics of the size that it says."
         )
+
+
+def _pinholes(source, everything, lenses):
+    """`Camera` of the pictures without their lenses."""
+    each = [shot.intrinsics if lens is None else lens.pinhole for shot, lens in zip(everything, lenses, strict=True)]
+    poses = np.stack([shot.camera_from_world for shot in everything])
+    cameras = Camera(as_float32(source, np.stack(each)), as_float32(source, poses))
+    check_camera(str(source), cameras)
+    return cameras
 
 
 def _lens_of(source, shot, known):

@@ -15,6 +15,8 @@ Held out are the frames of `val_filenames` and `test_filenames`, or, where neith
 
 import json
 import math
+import os
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,11 +29,12 @@ from zestjax.io.layouts import Record, every_eighth
 from zestjax.io.lens import COEFFICIENTS, UNDISTORT
 from zestjax.io.pictures import SUFFIXES, image_size, write_image
 from zestjax.io.posed import NO_BOUNDS, Posed, about_of, file_inside, intrinsics_of, near_far, record_of, write_about
-from zestjax.io.reading import in_order, json_numbers, read_json
+from zestjax.io.reading import FileWarning, in_order, json_numbers, read_json
 from zestjax.video import Video
 
 MARKER = "transforms.json"
 PINHOLES = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "perspective")
+UNREAD = ("mask_path", "depth_file_path")
 SPLITS = ("val_filenames", "test_filenames")
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # of OpenGL's y and z axis
 
@@ -47,6 +50,9 @@ def read_transforms(path: Path) -> Record:
     Raises:
       ValueError: the file is not what it should be, a camera is none or of a fisheye, a picture is missing or not under
         the folder, two frames have one time, or the depth bounds are not said.
+
+    Warns:
+      FileWarning: masks or depths of frames, which are not read.
     """
     source = path / MARKER
     found = read_json(source)
@@ -57,9 +63,13 @@ def read_transforms(path: Path) -> Record:
     bounds = near_far(source, found) or bounds
     if bounds is None:
         raise ValueError(f"{source}: has no `near` and `far`; add them, or {NO_BOUNDS}")
+    if left := [key for key in UNREAD if any(key in frame for frame in frames)]:
+        warnings.warn(f"{source}: names files by {' and '.join(left)}, which are not read.", FileWarning, stacklevel=3)
     files = [_picture(path, source, frame) for frame in frames]
     places = _in_time(source, frames, files)
-    size = image_size(files[places[0]]) if files[places[0]].exists() else (0, 0)  # a missing one is refused by name
+    size = (
+        image_size(files[places[0]]) if os.path.exists(files[places[0]]) else (0, 0)
+    )  # a missing one is refused by name
     posed = [_posed(source, found | frames[i], files[i], size) for i in places]
     held = _held_out(path, source, found)
     reserved = every_eighth(len(posed)) if held is None else [i for i, shot in enumerate(posed) if shot.image in held]
@@ -69,8 +79,8 @@ def read_transforms(path: Path) -> Record:
 def _picture(path, source, frame):
     """The file of a frame, whose suffix may be left out."""
     file = file_inside(path, frame.get("file_path"), source)
-    if file.suffix.lower() not in SUFFIXES and not file.exists():
-        file = next((there for s in SUFFIXES if (there := file.with_name(file.name + s)).exists()), file)
+    if file.suffix.lower() not in SUFFIXES and not os.path.exists(file):
+        file = next((there for s in SUFFIXES if os.path.exists(there := file.with_name(file.name + s))), file)
     return file
 
 
@@ -81,6 +91,10 @@ def _in_time(source, frames, files):
         if len(set(files)) < len(files):
             twice = next(file for i, file in enumerate(files) if file in files[:i])
             raise ValueError(f"{source}: lists {twice.name} twice; keep one of its cameras.")
+        if len({file.parent for file in files}) > 1:
+            raise ValueError(
+                f"{source}: frames lie in several folders and have no `time`, so no order; give them times."
+            )
         place = {file: i for i, file in enumerate(files)}
         return [place[file] for file in in_order(files)]
     if not all(timed):
