@@ -356,7 +356,7 @@ def retold_counts(rng, content):
 
 
 def retold_words(rng, content):
-    """A text of which one word is another: odd numbers, places outside, nothing."""
+    """A text of which one word is another: an odd or a plain number, a place outside, nothing."""
     words = re.split(rb"([ ,\n]+)", content)
     odd = [
         b"nan",
@@ -375,7 +375,7 @@ def retold_words(rng, content):
         b"#",
         b"\n",
     ]
-    words[rng.randrange(len(words))] = rng.choice(odd)
+    words[rng.randrange(len(words))] = rng.choice(odd if rng.random() < 0.6 else [b"1", b"2", b"5"])
     return b"".join(words)
 
 
