@@ -13,7 +13,10 @@ import io
 import json
 import multiprocessing
 import random
+import re
 import resource
+import shutil
+import struct
 import sys
 import tempfile
 import time
@@ -31,6 +34,7 @@ from zestjax.apps.paths import camera_path
 from zestjax.apps.weights import recipe_from_metadata
 from zestjax.base.parts import to_stored
 from zestjax.cameras import Camera
+from zestjax.io.colmap import write_colmap
 from zestjax.io.reading import FileWarning
 from zestjax.io.scenes import load_scene
 from zestjax.io.torch_files import LEGACY_MAGIC, read_torch
@@ -144,6 +148,55 @@ def nrnerf(root, file):
     cameras = np.zeros((N, 3, 5))
     cameras[:, :, :3], cameras[:, 0, 3], cameras[:, :, 4] = np.eye(3), 0.1 * np.arange(N), [HEIGHT, WIDTH, 30.0]
     file.write_text(json.dumps({"poses": cameras.tolist(), "bds": [[1.0, 9.0]] * N}))
+    (root / "poses_bounds.npy").unlink()
+
+
+def colmap(root, file):
+    """A model of COLMAP whose files are binary or text, as `file`."""
+    shutil.rmtree(root / "sparse", ignore_errors=True)
+    k, poses = np.tile(np.eye(3), (N, 1, 1)), np.tile(np.eye(4), (N, 1, 1))
+    k[:, 0, 0] = k[:, 1, 1] = 30
+    k[:, :2, 2], poses[:, 0, 3] = [15.5, 11.5], 0.1 * np.arange(N)
+    shown = Video(np.zeros((N, HEIGHT, WIDTH, 3), np.uint8), Camera(k, poses), np.float32(1), np.float32(9))
+    points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 6], (9, 3))
+    write_colmap(root / "whole", "toy", shown, binary=file.suffix == ".bin", points=points)
+    (root / "whole/sparse").rename(root / "sparse")
+    shutil.rmtree(root / "whole")
+    (root / "poses_bounds.npy").unlink()
+
+
+def transforms(root, file):
+    frame = lambda i: dict(
+        file_path=f"images/{i:05d}.png",
+        time=i,
+        transform_matrix=[[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+    )
+    said = dict(w=WIDTH, h=HEIGHT, fl_x=30.0, fl_y=30.0, cx=16.0, cy=12.0, k1=0.02, k2=0.0, near=1, far=9)
+    file.write_text(json.dumps(said | {"frames": [frame(i) for i in range(N)]}))
+    (root / "poses_bounds.npy").unlink()
+
+
+def nerfies(root, file):
+    names = [f"{i:05d}" for i in range(N)]
+    (root / "rgb").mkdir()
+    (root / "images").rename(root / "rgb/1x")
+    (root / "poses_bounds.npy").unlink()
+    (root / "camera").mkdir(exist_ok=True)
+    write = lambda place, content: (root / place).write_text(json.dumps(content))
+    for i, name in enumerate(names):
+        camera = dict(orientation=np.eye(3).tolist(), position=[0.1 * i, 0, 0], focal_length=30.0, skew=0.0,
+                      principal_point=[16.0, 12.0], image_size=[WIDTH, HEIGHT], pixel_aspect_ratio=1.0,
+                      radial_distortion=[0.01, 0, 0], tangential_distortion=[0, 0])  # fmt: skip
+        write(f"camera/{name}.json", camera)
+    write("dataset.json", dict(count=N, num_exemplars=N, ids=names, train_ids=names, val_ids=[]))
+    write("metadata.json", {name: dict(warp_id=i, appearance_id=i, camera_id=0) for i, name in enumerate(names)})
+    write("scene.json", dict(scale=1.0, center=[0, 0, 0], near=1, far=9))
+
+
+def table(root, file):
+    head = "file,time,width,height,fx,fy,cx,cy,qw,qx,qy,qz,tx,ty,tz,near,far\n"
+    lines = [f"images/{i:05d}.png,{i},{WIDTH},{HEIGHT},30,30,15.5,11.5,1,0,0,0,{0.1 * i},0,0,1,9\n" for i in range(N)]
+    file.write_text(head + "".join(lines))
     (root / "poses_bounds.npy").unlink()
 
 
@@ -291,6 +344,41 @@ def retold_header(rng, content):
     return len(header).to_bytes(8, "little") + header + content[8 + length :]
 
 
+def retold_counts(rng, content):
+    """A binary file of which one number, of some bytes, is another: counts, kinds, sizes, coordinates."""
+    place, size = rng.randrange(max(1, len(content) - 8)), rng.choice([4, 8])
+    odd = [0, 1, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**64 - 1]
+    numbers = [struct.pack("<d", value) for value in (0.0, -1.0, 1e300, float("nan"), float("inf"), 1e-300)]
+    new = rng.choice([rng.choice(odd).to_bytes(8, "little")[:size], rng.choice(numbers)])
+    if rng.random() < 0.3:
+        place = 0
+    return content[:place] + new + content[place + len(new) :]
+
+
+def retold_words(rng, content):
+    """A text of which one word is another: an odd or a plain number, a place outside, nothing."""
+    words = re.split(rb"([ ,\n]+)", content)
+    odd = [
+        b"nan",
+        b"inf",
+        b"-1",
+        b"0",
+        b"1e308",
+        b"9" * 5000,
+        b"../../x.png",
+        b"/x",
+        b"C:\\x",
+        b"",
+        b"x",
+        b"\xff",
+        b'"',
+        b"#",
+        b"\n",
+    ]
+    words[rng.randrange(len(words))] = rng.choice(odd if rng.random() < 0.6 else [b"1", b"2", b"5"])
+    return b"".join(words)
+
+
 def retold_picture(rng, content):
     """A picture of another size, depth or number of channels, or whose header claims much."""
     suffix = ".png" if content[1:4] == b"PNG" else ".jpg"
@@ -358,6 +446,18 @@ FORMATS = {
     "flow .npz": part_of_scene("flow_i1/00001_fwd.npz", flow, retell=retold_arrays),
     "flow .flo": part_of_scene("flow_i1/00001_fwd.flo", flow, retell=retold_flo),
     "truth .npz": part_of_scene("truth/00000_cam02.npz", truth, held_out=True, retell=retold_arrays),
+    **{
+        f"COLMAP {name}": part_of_scene(
+            f"sparse/0/{name}", colmap, retell=retold_counts if name.endswith("bin") else retold_words
+        )
+        for name in ("cameras.bin", "images.bin", "points3D.bin", "cameras.txt", "images.txt", "points3D.txt")
+    },
+    "transforms.json": part_of_scene("transforms.json", transforms, retell=retold_json),
+    **{
+        f"Nerfies {name}": part_of_scene(name, nerfies, retell=retold_json)
+        for name in ("dataset.json", "metadata.json", "scene.json", "camera/00001.json")
+    },
+    "cameras.csv": part_of_scene("cameras.csv", table, retell=retold_words),
     "cameras .json": camera_file(".json", retold_json),
     "cameras .npz": camera_file(".npz", retold_arrays),
     "weights .safetensors": weights,

@@ -435,7 +435,7 @@ def heic(folder):
 
 def foreign(folder):
     (folder / "poses_bounds.npy").unlink()
-    (folder / "transforms.json").write_text("{}")
+    (folder / "transforms_train.json").write_text("{}")
     (folder / "sparse").mkdir()
 
 
@@ -443,7 +443,7 @@ def foreign(folder):
     ("spoil", "parts"),
     [
         (heic, ("has poses_bounds.npy, but no pictures", ".heic are not read", ".png, .jpg")),
-        (foreign, ("none of poses_bounds.npy", "transforms.json is nerfstudio's", "sparse is COLMAP's")),
+        (foreign, ("none of poses_bounds.npy", "transforms_train.json is Blender's", "it has sparse, but no cameras")),
     ],
 )
 def test_an_unsupported_folder_is_told_what_is_missing(tmp_path, spoil, parts):

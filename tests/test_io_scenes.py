@@ -293,8 +293,8 @@ def test_a_damaged_scene_is_refused_by_the_file_at_fault(folder, spoil, message)
 def test_options_are_checked(written, tmp_path):
     with pytest.raises(ValueError, match="`protocol` is 'fair'"):
         load_scene(written[0], protocol="fair")
-    with pytest.raises(ValueError, match="`layout` is 'colmap'"):
-        load_scene(written[0], layout="colmap")
+    with pytest.raises(ValueError, match="`layout` is 'blender'"):
+        load_scene(written[0], layout="blender")
     (tmp_path / "precomputed.json").write_text("{}")
     with pytest.raises(ValueError, match="should hold `poses`"):
         load_scene(tmp_path)

@@ -12,14 +12,18 @@ Depth bounds are the sphere's, over all cameras. Held out are photographs 23, 24
 
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
+from zestjax.base.types import FilePath
 from zestjax.cameras import Camera
+from zestjax.io.files import replaced_folder
 from zestjax.io.layouts import MOST_DEPTH, Record, as_float32, check_order, every_eighth, pictures_in
-from zestjax.io.pictures import image_size
+from zestjax.io.pictures import image_size, write_image
 from zestjax.io.reading import check_numbers, read_arrays, visible
+from zestjax.video import Video
 
 FILES = ("cameras_sphere.npz", "cameras.npz")
 DTU_COUNT, DTU_RESERVED = 49, (23, 24, 32, 44)
@@ -128,3 +132,35 @@ def _native(source, cameras, images, size):
         f"{images[0].name} ({have[0]}x{have[1]}, HxW): were the pictures resized or cropped? Give those that the "
         f"matrices are of, or add `size` (height, width), in which they count pixels, to {source.name}."
     )
+
+
+def write_idr(folder: FilePath, video: Video) -> None:
+    """Write photographs in this layout, all or nothing; a scene is called as its folder.
+
+    The layout has a sphere for depth bounds: that about the point in the middle of all views which holds near to far of
+    every camera, so that they may be wider when they are read.
+
+    Args:
+      folder: the destination: absent, empty, or an earlier scene of this layout, which is replaced.
+      video: `Video`; its images may be uint8.
+
+    Raises:
+      ValueError: cameras among which no such sphere has room, as it must be in front of all of them; or a folder with
+        something else in it, which is left alone.
+      OSError: the disk is full or the place not writable; nothing half-written is left.
+    """
+    k, poses = (np.asarray(leaf, np.float64) for leaf in video.cameras)
+    near, far = float(video.near), float(video.far)
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    middle = np.append((centres + (near + far) / 2 * poses[:, 2, :3]).mean(0), 1)
+    depth = np.einsum("nij,j->ni", poses, middle)[:, 2]
+    sphere = np.diag([*[max((depth - near).max(), (far - depth).max())] * 3, 1])
+    if depth.min() <= sphere[0, 0]:
+        raise ValueError("write_idr: no sphere in front of all cameras holds near to far; this layout needs one.")
+    sphere[:3, 3] = middle[:3]
+    arrays: dict[str, Any] = {f"world_mat_{i}": np.vstack([k[i] @ poses[i, :3], [0, 0, 0, 1]]) for i in range(len(k))}
+    arrays |= {f"scale_mat_{i}": sphere for i in range(len(k))}
+    with replaced_folder(folder, marker=FILES[0]) as root:
+        np.savez(root / FILES[0], **arrays, size=np.array(np.shape(video.images)[1:3]))
+        for i, image in enumerate(video.images):
+            write_image(root / f"image/{i:05d}.png", image)

@@ -15,6 +15,7 @@ import numpy as np
 
 from zestjax.base.types import FilePath
 from zestjax.cameras import Camera
+from zestjax.io.lens import Lens
 from zestjax.io.pictures import SUFFIXES
 from zestjax.io.reading import in_order, numbers_of, visible
 
@@ -27,7 +28,8 @@ class HeldOut:
     """A picture of another camera than the one that took the frame of its time.
 
     time: int. camera_name: str. camera: `Camera` of numpy arrays at native size. image: its file. mask: file of the
-    moving pixels, or None. truth: npz file with any of `depth` (H, W) and `flow` (H, W, 2), or None.
+    moving pixels, or None. truth: npz file with any of `depth` (H, W) and `flow` (H, W, 2), or None. lens: what bends
+    the picture in its file, or None; the camera is that of the picture without it.
     """
 
     time: int
@@ -36,6 +38,7 @@ class HeldOut:
     image: Path
     mask: Path | None = None
     truth: Path | None = None
+    lens: Lens | None = None
 
 
 class Later(Sequence):
@@ -59,6 +62,8 @@ class Record:
     size. size: (height, width) native. near, far: depth bounds, world units. motion_masks, disparity, flow_forward,
     flow_backward, truth: file by frame index, for the frames that have one. held_out: pictures of other cameras.
     reserved: frames that the held-out protocol predicts, and keeps from all inputs, where photographs are all there is.
+    lenses: by frame index, what bends the picture in its file; cameras are of the pictures without it. transparent:
+    colours under transparent pixels are the scene's all the same.
     """
 
     name: str
@@ -75,11 +80,13 @@ class Record:
     truth: Mapping[int, Path] = field(default_factory=dict)
     held_out: Sequence[HeldOut] = ()
     reserved: tuple[int, ...] = ()
+    lenses: Mapping[int, Lens] = field(default_factory=dict)
+    transparent: bool = False
 
     def first(self, count: int) -> "Record":
         """The record of the first frames alone."""
         early = lambda files: {time: path for time, path in files.items() if time < count}
-        maps = ("motion_masks", "disparity", "flow_forward", "flow_backward", "truth")
+        maps = ("motion_masks", "disparity", "flow_forward", "flow_backward", "truth", "lenses")
         held = self.held_out
         return replace(
             self, images=self.images[:count], cameras=select(self.cameras, slice(count)),

@@ -19,7 +19,6 @@ and, where the truth is known, `truth/00000.npz` by frame and `truth/00000_cam02
 `flow`, and its camera), with `scene.json` for the name and the exact depth bounds.
 """
 
-import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -30,7 +29,6 @@ from zestjax.base.types import Array, FilePath
 from zestjax.cameras import Camera, camera_from_llff_pose, check_camera
 from zestjax.io.files import replaced_folder
 from zestjax.io.layouts import (
-    MOST_DEPTH,
     HeldOut,
     Later,
     Record,
@@ -45,7 +43,8 @@ from zestjax.io.layouts import (
     select,
 )
 from zestjax.io.pictures import SUFFIXES, write_image
-from zestjax.io.reading import check_numbers, json_numbers, numbers_of, read_array, read_arrays, read_json, visible
+from zestjax.io.posed import about_of, write_about
+from zestjax.io.reading import check_numbers, numbers_of, read_array, read_arrays, visible
 from zestjax.io.rig import find_rig, numbered, targets_of
 from zestjax.video import Video
 
@@ -78,7 +77,7 @@ def read_nsff(path: Path) -> Record:
     size, _ = check_sizes(source, poses[..., 4])
     cameras = Camera(*map(np.asarray, camera_from_llff_pose(as_float32(source, poses))))
     scene = path.resolve().parent if path.resolve().name == "dense" else path.resolve()
-    name, bounds = _about(root / "scene.json")
+    name, bounds = about_of(root)
     near, far = bounds or bounds_from_frames(rows[:, 15:], where=str(source))
     listed = lambda folder, suffixes: one_each(root / folder, files_in(root / folder, suffixes), images)
     forward, backward = _flows(root / "flow_i1", images)
@@ -97,20 +96,6 @@ def read_nsff(path: Path) -> Record:
         truth=_truths(root / "truth", images),
         held_out=Later(lambda: _held_out(root, images, cameras)),
     )
-
-
-def _about(path):
-    """(name or None, (near, far) or None) that `scene.json` tells, if there is one."""
-    about = read_json(path) if path.exists() else {}
-    name = about.get("name")
-    if name is not None and not isinstance(name, str):
-        raise ValueError(f"{path}: `name` is a {type(name).__name__}, expected text; write it again.")
-    if "near" not in about:
-        return name, None
-    near, far = (float(json_numbers(path, about, key, shape=())) for key in ("near", "far"))
-    if not 0 < near < far < MOST_DEPTH:
-        raise ValueError(f"{path}: expected 0 < `near` < `far`, got {near:g} and {far:g}; write it again.")
-    return name, (near, far)
 
 
 def write_nsff(
@@ -146,8 +131,7 @@ def write_nsff(
     rows = poses_bounds(video)
     with replaced_folder(folder, marker=MARKER) as root:
         np.save(root / MARKER, rows)
-        about = {"name": name, "near": float(video.near), "far": float(video.far)}
-        (root / "scene.json").write_text(json.dumps(about, indent=1))
+        write_about(root, name, (float(video.near), float(video.far)))
         for i, image in enumerate(np.asarray(video.images)):
             write_image(root / f"images/{i:05d}.png", image)
             if motion_masks is not None:

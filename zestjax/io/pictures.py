@@ -23,7 +23,7 @@ MOST_GREY = 0.01  # of a mask's pixels before it is doubted: edges of a JPEG sta
 UNREADABLE = "is not a picture that can be read (truncated, or none of PNG, JPEG, BMP, WebP and TIFF); replace it."
 
 
-def read_image(path: FilePath, *, native: tuple[int, int] | None = None) -> np.ndarray:
+def read_image(path: FilePath, *, native: tuple[int, int] | None = None, transparent: bool = False) -> np.ndarray:
     """An image file as (H, W, 3) float32 RGB in [0, 1], its pixels as they are stored; grey becomes RGB.
 
     A tag that asks viewers to turn the picture (EXIF) is not followed: poses are of the pixels as stored. What lies
@@ -32,6 +32,7 @@ def read_image(path: FilePath, *, native: tuple[int, int] | None = None) -> np.n
     Args:
       path: the file.
       native: (height, width) that its cameras count pixels in; see `check_fits`.
+      transparent: take the colours under transparent pixels all the same, with a `FileWarning`.
 
     Raises:
       ValueError: the file is missing, no image that OpenCV reads, of floats, partly transparent, or does not fit.
@@ -42,8 +43,12 @@ def read_image(path: FilePath, *, native: tuple[int, int] | None = None) -> np.n
     colours, alpha = _colours(pixels)
     unused = path.suffix.lower() == ".bmp" and alpha is not None and not alpha.any()
     if alpha is not None and not unused and (share := float((alpha < _full(pixels)).mean())):
-        raise ValueError(
-            f"{path}: {share:.1%} of it are transparent; lay it on a background, or save it without alpha."
+        if not transparent:
+            raise ValueError(
+                f"{path}: {share:.1%} of it are transparent; lay it on a background, or save it without alpha."
+            )
+        warnings.warn(
+            f"{path.parent}: has transparent pixels, whose stored colours are used.", FileWarning, stacklevel=2
         )
     shades = colours[..., ::-1] if colours.shape[2] == 3 else np.repeat(colours, 3, -1)
     return np.ascontiguousarray(shades).astype(np.float32) / _full(pixels)

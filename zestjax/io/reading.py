@@ -80,7 +80,7 @@ def read_array(path: FilePath, *, shape: Sequence[int | None] | None = None) -> 
     content = read_regular(path)
     if content[: len(ZIP)] == ZIP:
         raise ValueError(f"{path}: is an archive of arrays (.npz), expected one array (.npy); save the array alone.")
-    with _explained(path, "is not a numpy file that can be read"):
+    with explained(path, "is not a numpy file that can be read"):
         array = _array(content)
     return check_numbers(path, array, shape=shape)
 
@@ -101,7 +101,7 @@ def read_arrays(path: FilePath, *, names: Collection[str] | None = None) -> dict
             raise ValueError(
                 f"{path}: holds one array (.npy), expected arrays by name (.npz); save it with their names."
             )
-        with _explained(path, "is not a numpy file that can be read"), zipfile.ZipFile(file) as archive:
+        with explained(path, "is not a numpy file that can be read"), zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             wanted = {name: info for name, info in members.items() if names is None or name in names}
             if sum(info.file_size for info in wanted.values()) > MOST_BYTES:
@@ -151,7 +151,7 @@ def read_json(path: FilePath) -> dict[str, Any]:
       ValueError: it cannot be read, is no JSON, no object, nested too deeply, or has numbers that are none.
     """
     content = read_regular(path, most=MOST_JSON)
-    with _explained(path, "is not JSON that can be read"):
+    with explained(path, "is not JSON that can be read"):
         found = parse_json(content, constant=_refused)
     if not isinstance(found, dict):
         raise ValueError(f"{path}: holds a {type(found).__name__}, expected an object with names; write it again.")
@@ -185,7 +185,7 @@ def json_numbers(
     """
     if name not in found:
         raise ValueError(f"{path}: has no `{name}`, only {_some(found)}; write it again.")
-    with _explained(path, f"`{name}` is no array of numbers"):
+    with explained(path, f"`{name}` is no array of numbers"):
         array = np.asarray(found[name])
     return check_numbers(path, array, shape=shape, name=name, finite=True).astype(np.float64)
 
@@ -256,7 +256,7 @@ def _larger(path, most):
 
 
 @contextlib.contextmanager
-def _explained(path, what):
+def explained(path: FilePath, what: str) -> Iterator[None]:
     """Context: whatever damage raises leaves it as a ValueError that says what the file is not, and what to do."""
     try:
         with warnings.catch_warnings():

@@ -28,26 +28,53 @@ from zestjax.base.checks import check_option
 from zestjax.base.types import FilePath
 from zestjax.cameras import Camera, resized
 from zestjax.frames.inputs import check_inputs
+from zestjax.io.colmap import is_colmap, read_colmap
 from zestjax.io.idr import is_idr, read_idr
 from zestjax.io.layouts import select
+from zestjax.io.lens import undistorted
 from zestjax.io.llff import is_llff, read_llff
 from zestjax.io.maps import FlowMaps, disparity_of, flow_of, masks_of, truth_of
+from zestjax.io.n3dv import is_n3dv, read_n3dv
+from zestjax.io.nerfies import is_nerfies, read_nerfies
 from zestjax.io.nrnerf import is_nrnerf, read_nrnerf
 from zestjax.io.nsff import is_nsff, read_nsff
 from zestjax.io.pictures import SUFFIXES, image_size, read_image, read_mask, resize_area, resize_nearest
 from zestjax.io.reading import open_regular, visible
+from zestjax.io.table import is_table, read_table
+from zestjax.io.transforms import is_transforms, read_transforms
 from zestjax.video import Video
 
 PROTOCOLS = ("held-out", "strict", "paper", "fixed-view")
 FIXED_VIEW_FRAMES = 12  # as DynNeRF counts them, one of each camera of the rig
 
 LAYOUTS = dict(
-    idr=(is_idr, read_idr), llff=(is_llff, read_llff), nsff=(is_nsff, read_nsff), nrnerf=(is_nrnerf, read_nrnerf)
+    idr=(is_idr, read_idr),
+    llff=(is_llff, read_llff),
+    nsff=(is_nsff, read_nsff),
+    nrnerf=(is_nrnerf, read_nrnerf),
+    table=(is_table, read_table),
+    nerfies=(is_nerfies, read_nerfies),
+    transforms=(is_transforms, read_transforms),
+    colmap=(is_colmap, read_colmap),
+    n3dv=(is_n3dv, read_n3dv),
 )
-"""By name: a function of the folder that recognises it, and one that reads it to a `zestjax.io.layouts.Record`."""
+"""By name: a function of the folder that recognises it, and one that reads it to a `zestjax.io.layouts.Record`. A
+folder in several of them is read by the first, unless one is named."""
 
-MARKS = ("poses_bounds.npy", "cameras_sphere.npz", "cameras.npz", "precomputed.json")  # the layouts' files of cameras
-FOREIGN = {"transforms.json": "nerfstudio's", "transforms_train.json": "Blender's", "sparse": "COLMAP's"}
+_PICTURES = "no pictures to it in images/ or image/"
+MARKS = {
+    "poses_bounds.npy": _PICTURES,
+    "cameras_sphere.npz": _PICTURES,
+    "cameras.npz": _PICTURES,
+    "precomputed.json": "it is no file",
+    "cameras.csv": "it is no file",
+    "dataset.json": "not metadata.json, scene.json and camera/ besides",
+    "transforms.json": "it is no file",
+    "sparse": "no cameras and images (.bin or .txt) in it or in sparse/0, or no pictures to them in images/",
+}
+"""By name: the layouts' files of cameras, and what may miss where one is there and the layout is not recognised."""
+
+FOREIGN = {"transforms_train.json": "Blender's"}
 
 
 @dataclass(frozen=True)
@@ -146,7 +173,7 @@ def load_scene(
     size = _size(stored, height, width)
     images = np.zeros((len(record.images), *size, 3), np.float32)
     for i in shown:
-        images[i] = resize_area(read_image(record.images[i], native=record.size), *size)
+        images[i] = _picture(record, record.images[i], record.lenses.get(i), size)
     cameras = _resized(record.cameras, record.size, size)
     video = Video(images, cameras, np.float32(record.near), np.float32(record.far))
     check_inputs(str(path), video)
@@ -212,20 +239,19 @@ def scenes_in(path: FilePath, *, known: Mapping[str, tuple] = LAYOUTS) -> list[t
 def _unsupported(path, known):
     """Why a folder is in none of some layouts: which of their files are there, and what is not read of the rest."""
     inside = {p.name: p for root in (path / "dense", path) for p in visible(root)}
-    names, marks = sorted(inside), [name for name in MARKS if name in inside]
+    marks = [name for name in MARKS if name in inside]
     for name in marks:
-        with open_regular(inside[name]):  # or it is refused by what it is
-            pass
+        if name != "sparse":
+            with open_regular(inside[name]):  # or it is refused by what it is
+                pass
     folders = [p for root in (path, path / "dense") for p in visible(root) if re.fullmatch(r"images?(_.*)?", p.name)]
     others = sorted({p.suffix.lower() for folder in folders for p in visible(folder)} - {*SUFFIXES, ""})
     said = [f"is in none of the supported layouts ({', '.join(known)})"]
-    if marks:
-        said.append(f"it has {' and '.join(marks)}, but no pictures to it in images/ or image/")
-    else:
-        said.append(f"it has none of {', '.join(MARKS)}")
+    said += [f"it has {name}, but {MARKS[name]}" for name in marks]
+    said.append(f"it has none of {', '.join(name for name in MARKS if name not in marks)}")
     if others:
         said.append(f"files of {', '.join(others[:5])} are not read, pictures of {', '.join(SUFFIXES)} are")
-    said += [f"{name} is {whose}, which is not read" for name, whose in FOREIGN.items() if name in names]
+    said += [f"{name} is {whose}, which is not read" for name, whose in FOREIGN.items() if name in inside]
     return "; ".join(said) + "; see `zestjax.io` on each."
 
 
@@ -237,6 +263,12 @@ def _size(have, height, width):
     if min(height, width) < 1:
         raise ValueError(f"load_scene: the size is {height}x{width}, expected at least 1x1.")
     return int(height), int(width)
+
+
+def _picture(record, file, lens, size):
+    """A picture's file as the record's cameras see it: without distortion, at a size."""
+    stored = read_image(file, native=record.size, transparent=record.transparent)
+    return resize_area(undistorted(stored, lens, record.size), *size)
 
 
 def _resized(cameras, have, size):
@@ -289,7 +321,7 @@ def _other_views(record, size):
             time=entry.time,
             camera_name=entry.camera_name,
             camera=_resized(entry.camera, record.size, size),
-            image=resize_area(read_image(entry.image, native=record.size), *size),
+            image=_picture(record, entry.image, entry.lens, size),
             dynamic=None if entry.mask is None else resize_nearest(read_mask(entry.mask, native=record.size), *size),
             **truth_of(record, entry.truth, size),
         )
