@@ -82,6 +82,8 @@ def measured(source, height, *, quiet=False):
         sharp.append(sharpness(small))
         same.append(before is not None and np.array_equal(small, before))
         before, brightest = small, max(brightest, int(small.max()))
+    if not brightest:
+        raise ValueError(f"{source.path}: all its frames are black; give ones that show something.")
     different = len(same) - sum(same)
     if different < LEAST_FRAMES:
         said = f"{len(sharp)} equal frames are" if len(sharp) > 1 else "one frame is"
@@ -90,8 +92,6 @@ def measured(source, height, *, quiet=False):
         raise ValueError(
             f"{source.path}: has {stored[0]}x{stored[1]} pixels (HxW); give frames of {LEAST_SIDE} or more either way."
         )
-    if not brightest:
-        raise ValueError(f"{source.path}: all its frames are black; give ones that show something.")
     return Measured(sharp, same, stored, size)
 
 

@@ -122,10 +122,9 @@ def _equations(bundle, seen, error, scale):
     root = np.sqrt(robust_weights(error, scale=scale))[:, None]
     by, error = slopes(bundle, seen), error * root
     pose, focal, point = by.pose * root[..., None], by.focal * root, by.point * root[..., None]
-    summed = lambda index, values, n: _summed(index, values, n)
     cameras = np.zeros((6 * count + 1, 6 * count + 1))
-    blocks = summed(seen.frame, np.einsum("mka,mkb->mab", pose, pose), count)
-    border = summed(seen.frame, np.einsum("mka,mk->ma", pose, focal), count).ravel()
+    blocks = _summed(seen.frame, np.einsum("mka,mkb->mab", pose, pose), count)
+    border = _summed(seen.frame, np.einsum("mka,mk->ma", pose, focal), count).ravel()
     for i, block in enumerate(blocks):
         cameras[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = block
     cameras[-1, :-1] = cameras[:-1, -1] = border
@@ -133,18 +132,18 @@ def _equations(bundle, seen, error, scale):
     between = np.zeros((3, 6 * count + 1, points))
     shared = np.swapaxes(pose, 1, 2) @ point
     between[:, :-1].reshape(3, count, 6, points)[:, seen.frame, :, seen.point] = np.moveaxis(shared, 2, 1)
-    between[:, -1] = summed(seen.point, np.einsum("mk,mkb->mb", focal, point), points).T
+    between[:, -1] = _summed(seen.point, np.einsum("mk,mkb->mb", focal, point), points).T
     by_camera = np.append(
-        summed(seen.frame, np.einsum("mka,mk->ma", pose, error), count).ravel(), np.sum(focal * error)
+        _summed(seen.frame, np.einsum("mka,mk->ma", pose, error), count).ravel(), np.sum(focal * error)
     )
-    own = summed(seen.point, np.einsum("mka,mkb->mab", point, point), points)
-    by_point = summed(seen.point, np.einsum("mka,mk->ma", point, error), points)
+    own = _summed(seen.point, np.einsum("mka,mkb->mab", point, point), points)
+    by_point = _summed(seen.point, np.einsum("mka,mk->ma", point, error), points)
     return _Equations(cameras, own, between, by_camera, by_point)
 
 
 def _summed(index, values, count):
     """(count, ...) sums of the values (M, ...) of each index."""
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
     sums = np.stack([np.bincount(index, column, count) for column in flat.T], -1)
     return sums.reshape(count, *values.shape[1:])
 

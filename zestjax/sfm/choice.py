@@ -38,7 +38,7 @@ def chosen_frames(sharp: Sequence[float], *, most: int) -> tuple[int, ...]:
     chosen = []
     for start, end in zip(edges[:-1], edges[1:], strict=True):
         margin = (1 - CENTRAL) / 2 * (end - start)
-        window = range(int(np.ceil(start + margin - 0.5)), max(int(np.ceil(end - margin - 0.5)), 0))
+        window = range(int(np.ceil(start + margin - 0.5)), int(np.floor(end - margin - 0.5)) + 1)
         window = window or range(int((start + end) / 2), int((start + end) / 2) + 1)
         chosen.append(max(window, key=lambda i: sharp[i]))
     return tuple(chosen)
