@@ -35,7 +35,7 @@ def known(monkeypatch):
     """The cameras need not be found."""
     seen = lambda count, value: np.full(count, value)
 
-    def cameras(images, *, avoid=None, focal=None, start=None, seed=0, watch=None):
+    def cameras(images, *, avoid, focal, start, free_focal, seed, watch):
         count = len(images)
         return Estimated(
             "moving", path(COUNT)[:count], np.ones(count, bool), focal or 120.0, None if focal else 0.01, 1.0, 8.0,

@@ -187,20 +187,22 @@ def _two_passes(options, told, work, images):
 
 
 def _cameras(options, told, path, images, avoid, start, before):
-    """The cameras; where what moves leaves too little for a second pass, those of the first stay."""
+    """The cameras, the focal length held in the first pass; where what moves leaves too little for a second one, those
+    of the first stay."""
 
     def make():
         found = before
         try:
             watch = lambda items, label: progress(items, label, quiet=options.quiet)
             found = estimate_cameras(
-                images, avoid=avoid, start=start, focal=_focal(options, told), seed=options.seed, watch=watch
-            )
+                images, avoid=avoid, start=start, focal=_focal(options, told), free_focal=before is not None,
+                seed=options.seed, watch=watch,
+            )  # fmt: skip
         except ValueError as error:
             if before is None:
                 raise ValueError(f"{options.source}: {str(error).partition(': ')[2]}") from error
-        if before is not None and found.registered.sum() < before.registered.sum():
-            found = before
+        if before is not None and (found.kind != before.kind or found.registered.sum() < before.registered.sum()):
+            found = before  # without what moves too little is left to tell, or to register
         return found._replace(kind=KINDS.index(found.kind), focal_error=found.focal_error or np.nan)
 
     cameras = _estimated(_stored(path, make))

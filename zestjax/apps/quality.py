@@ -147,7 +147,13 @@ def _of_geometry(report):
             f"frames far apart disagree by {drift['far']:.1f} pixels, near ones by {drift['near']:.1f}",
             ("a shorter part of the video, or more --frames, help"),
         )
-    if not focal["given"] and (focal["relative_error"] or 0) > MOST_FOCAL_ERROR:
+    if not focal["given"] and focal["relative_error"] is None:
+        yield (
+            "focal length",
+            "the focal length is a guess, as too little stands still to tell",
+            ("give --fov or --focal if it is known"),
+        )
+    elif not focal["given"] and focal["relative_error"] > MOST_FOCAL_ERROR:
         yield (
             "focal length",
             f"the focal length is known to {100 * focal['relative_error']:.0f} % only",

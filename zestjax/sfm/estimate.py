@@ -25,7 +25,7 @@ OTHER_FOCALS = (0.6, 1.5)  # tried where the usual one registers too few frames:
 ENOUGH = 0.9  # share of the frames that a start must register for no other one to be tried
 STILL = 0.5  # pixels: features are found to half of one, so that a camera that shifts them less stands still
 RESTING_SHARE = 0.1  # of the matches at one place, in most pairs: zest-bench has 0.02, a still camera in a car 0.15
-FLAT = 1.5  # pixels that a homography may leave of a camera that only turned, or of a scene that is a plane
+FLAT = 1.0  # pixels that a homography may leave of a camera that only turned, or of a scene that is a plane
 STILL_BOUNDS = (1.0, 100.0)  # of a camera without parallax, whose depths nobody knows: any would do
 ROUNDS = 10  # of weighting: wrong matches have lost their say after three or four
 FEW_PAIRS = 2  # pairs a frame, below which a video does not hang together
@@ -62,6 +62,7 @@ def estimate_cameras(
     avoid: Sequence[Array | None] | None = None,
     focal: float | None = None,
     start: float | None = None,
+    free_focal: bool = True,
     seed: int = 0,
     watch: Watch = lambda items, label: items,
 ) -> Estimated:
@@ -72,6 +73,8 @@ def estimate_cameras(
       avoid: (H, W) bool masks of pixels that move, or None, by frame.
       focal: pixels, where it is known; else it is estimated.
       start: pixels, where the estimation begins; by default `USUAL_FOCAL` of the longer side.
+      free_focal: estimate the focal length, where it is not known; else it stays where it starts. What moves can bend
+        it far, so that a first pass, which does not know what moves, had better hold it.
       seed: of the samples of robust fits.
       watch: shows progress.
 
@@ -92,7 +95,7 @@ def estimate_cameras(
     if kind != "moving":
         return _without_parallax(kind, features, pairs, guess, centre)
     tracks = join_matches(features, pairs)
-    free, count = focal is None, len(images)
+    free, count = focal is None and free_focal, len(images)
     begun = lambda f: reconstruct(tracks, pairs, count, focal=f, centre=centre, free_focal=free, seed=seed)
     best = begun(guess)
     if focal is None and start is None and (best is None or best.registered.mean() < ENOUGH):

@@ -23,7 +23,7 @@ THRESHOLD = 1.0  # pixels from the epipolar line: SIFT finds a place to half a p
 
 class Pair(NamedTuple):
     """first, second: frames. matches: (M, 2) int. shift: pixels, median distance of the matches. parallax: pixels, the
-    distance that the best homography leaves of all but a fifth of them: none where the camera only turned. resting:
+    distance that the best homography leaves of all but a tenth of them: none where the camera only turned. resting:
     share of the features alike, on one geometry or not, that are at one place in both: many where the camera stands
     still, whatever moves before it."""
 
@@ -75,7 +75,7 @@ def verified_pair(first: int, second: int, features: Sequence[Features], *, seed
         return None
     ours, theirs = ours[kept], theirs[kept]
     shift = float(np.median(np.linalg.norm(theirs - ours, axis=1)))
-    parallax = shift if flat is None else float(np.quantile(_left_by(flat, ours, theirs), 0.8))
+    parallax = shift if flat is None else float(np.quantile(_left_by(flat, ours, theirs), 0.9))
     return Pair(first, second, matches[kept], shift, parallax, resting)
 
 

@@ -23,6 +23,7 @@ TIGHT = (0.5, 2.0)  # pixels, between which the same lies at the end
 FIRM, SCALES = 2.0, (0.1, 1.0)  # medians at which a weight is halved at the end, within these pixels
 SPREAD = 5.0  # medians of the error that noise stays within: of two normal coordinates all but 1e-7
 STARTS = 12  # pairs of frames that are tried as the first one
+GROWN = 3  # of them that are grown to all frames: one may start on what moves
 TOGETHER = 0.7  # frames that see so large a share of what the best one sees are added with it
 
 
@@ -73,17 +74,11 @@ def reconstruct(
       enough from places far enough apart.
     """
     task = _Task(tracks, Seen(tracks.frame, tracks.track, tracks.pixels), centre, free_focal, seed)
-    state = _first_two(task, pairs, count, focal)
-    if state is None:
+    grown = [_grown(task, start, count) for start in _starts(task, pairs, count, focal)]
+    if not grown:
         return None
-    refused = np.zeros(count, bool)
-    while (joining := _joining(task, state, refused)).size:
-        before = state.registered.sum()
-        for frame in joining:
-            state, refused = _with_frame(task, state, int(frame), refused)
-        if state.registered.sum() > before:
-            state = _refined(task, _with_points(task, state, LOOSE), LOOSE, steps=8)
-            refused[:] = False
+    # What moves alike makes a world of its own; the one that explains most is the still one, where that is larger.
+    state = max(grown, key=lambda state: (state.registered.sum(), state.used.sum()))
     state = _refined(task, _with_points(task, state, LOOSE), LOOSE, steps=40)
     for free_focal in (False, task.free_focal, task.free_focal):
         noise = _noise(task, state)
@@ -99,11 +94,24 @@ def _noise(task, state):
     return float(np.median(error)) if len(error) else 1.0
 
 
-def _first_two(task, pairs, count, focal):
-    """The pair whose points are many and seen from far enough apart, adjusted alone; None where there is none."""
+def _grown(task, state, count):
+    """The state with every frame that sees enough of what is known by then."""
+    refused = np.zeros(count, bool)
+    while (joining := _joining(task, state, refused)).size:
+        before = state.registered.sum()
+        for frame in joining:
+            state, refused = _with_frame(task, state, int(frame), refused)
+        if state.registered.sum() > before:
+            state = _refined(task, _with_points(task, state, LOOSE), LOOSE, steps=8)
+            refused[:] = False
+    return state
+
+
+def _starts(task, pairs, count, focal):
+    """The pairs of frames whose points are many and seen from far enough apart, each alone, the best first."""
     ranked = sorted(pairs, key=lambda pair: -len(pair.matches) * min(pair.parallax, 4.0))[:STARTS]
     found = [start for pair in ranked if (start := _pair_start(task, pair, count, focal)) is not None]
-    return max(found, key=lambda start: start[0])[1] if found else None
+    return [start for _, start in sorted(found, key=lambda start: -start[0])[:GROWN]]
 
 
 def _pair_start(task, pair, count, focal):
