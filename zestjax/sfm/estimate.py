@@ -166,11 +166,11 @@ def _turned(features, pairs, count, focal, centre):
 
 def _turn_between(ours, theirs):
     """The rotation that brings most of our rays (M, 3) to theirs: Kabsch's, by what it leaves small."""
-    weights = np.ones(len(ours))
+    turn = nearest_rotation(theirs.T @ ours)
     for _ in range(ROUNDS):
-        turn = nearest_rotation((theirs * weights[:, None]).T @ ours)
         gap = np.linalg.norm(theirs - ours @ turn.T, axis=1)
         weights = 1 / (1 + (gap / max(np.median(gap), 1e-12)) ** 2) ** 2
+        turn = nearest_rotation((theirs * weights[:, None]).T @ ours)
     return turn
 
 
