@@ -24,7 +24,6 @@ USUAL_FOCAL = 0.9  # of a picture's longer side: 58 degrees across, between a te
 OTHER_FOCALS = (0.6, 1.5)  # tried where the usual one registers too few frames: 80 and 37 degrees
 ENOUGH = 0.9  # share of the frames that a start must register for no other one to be tried
 STILL = 0.5  # pixels: features are found to half of one, so that a camera that shifts them less stands still
-RESTING_SHARE = 0.1  # of the matches at one place, in most pairs: zest-bench has 0.02, a still camera in a car 0.15
 FLAT = 1.0  # pixels that a homography may leave of a camera that only turned, or of a scene that is a plane
 STILL_BOUNDS = (1.0, 100.0)  # of a camera without parallax, whose depths nobody knows: any would do
 ROUNDS = 10  # of weighting: wrong matches have lost their say after three or four
@@ -111,8 +110,7 @@ def estimate_cameras(
 
 def camera_motion(pairs: Sequence[Pair]) -> str:
     """ "still", "turning" (or before a plane: nothing tells how far anything is) or "moving", by what matches show."""
-    resting = np.median([pair.resting for pair in pairs])
-    if resting > RESTING_SHARE or np.quantile([pair.shift for pair in pairs], 0.9) < STILL:
+    if np.quantile([pair.shift for pair in pairs], 0.9) < STILL:
         return "still"
     return "turning" if np.quantile([pair.parallax for pair in pairs], 0.9) < FLAT else "moving"
 

@@ -17,22 +17,18 @@ RATIO = 0.9  # of the distances to the best and to the second best; geometry rem
 LEAST = 16  # matches of a pair that count: an epipolar geometry takes 7, and chance finds a dozen
 ALL_PAIRS = 40  # frames up to which every pair is tried: 780 pairs
 REACH = 8  # frames in time that are always tried
-RESTING = 1.0  # pixels by which a feature that rests is found elsewhere
 THRESHOLD = 1.0  # pixels from the epipolar line: SIFT finds a place to half a pixel
 
 
 class Pair(NamedTuple):
     """first, second: frames. matches: (M, 2) int. shift: pixels, median distance of the matches. parallax: pixels, the
-    distance that the best homography leaves of all but a tenth of them: none where the camera only turned. resting:
-    share of the features alike, on one geometry or not, that are at one place in both: many where the camera stands
-    still, whatever moves before it."""
+    distance that the best homography leaves of all but a tenth of them: none where the camera only turned."""
 
     first: int
     second: int
     matches: np.ndarray
     shift: float
     parallax: float
-    resting: float = 0.0
 
 
 def frame_pairs(count: int) -> list[tuple[int, int]]:
@@ -65,7 +61,6 @@ def verified_pair(first: int, second: int, features: Sequence[Features], *, seed
     if len(matches) < LEAST:
         return None
     ours, theirs = a.pixels[matches[:, 0]], b.pixels[matches[:, 1]]
-    resting = float((np.linalg.norm(theirs - ours, axis=1) < RESTING).mean())
     _, kept = _fitted(cv2.findFundamentalMat, ours, theirs, consensus(THRESHOLD, seed=seed))
     flat, _ = _fitted(cv2.findHomography, ours, theirs, consensus(2 * THRESHOLD, seed=seed))
     kept = np.zeros(len(ours), bool) if kept is None else kept.ravel() > 0
@@ -76,7 +71,7 @@ def verified_pair(first: int, second: int, features: Sequence[Features], *, seed
     ours, theirs = ours[kept], theirs[kept]
     shift = float(np.median(np.linalg.norm(theirs - ours, axis=1)))
     parallax = shift if flat is None else float(np.quantile(_left_by(flat, ours, theirs), 0.9))
-    return Pair(first, second, matches[kept], shift, parallax, resting)
+    return Pair(first, second, matches[kept], shift, parallax)
 
 
 def consensus(threshold: float, *, seed: int = 0) -> cv2.UsacParams:
