@@ -23,6 +23,7 @@ def parser():
     for add in (
         _demo,
         _simulate,
+        _prepare,
         _train,
         _finetune,
         _render,
@@ -60,6 +61,17 @@ def _simulate(commands):
     which.add_argument("--random", type=natural, metavar="KEY", help="a random scene, a function of this number")
     command.add_argument("--size", type=size, default=(144, 256), metavar="HxW")
     command.add_argument("--frames", type=positive, default=24)
+
+
+def _prepare(commands):
+    about = "a video file, or a folder of pictures, to a scene: cameras, flow, moving pixels, with a report"
+    command = _command(commands, "prepare", about, _run_prepare)
+    command.add_argument("source", type=Path, metavar="SOURCE", help="a video file, or a folder of pictures in order")
+    command.add_argument("--frames", type=positive, default=24, metavar="N", help="to keep at most (default 24)")
+    command.add_argument("--height", type=positive, default=288, metavar="H", help="of the scene at most (default 288)")
+    lens = command.add_mutually_exclusive_group()
+    lens.add_argument("--focal", type=positive_float, metavar="PIXELS", help="of the source (default: estimated)")
+    lens.add_argument("--fov", type=positive_float, metavar="DEGREES", help="seen across (default: estimated)")
 
 
 def _train(commands):
@@ -194,6 +206,12 @@ def _run_simulate(options):
     from zestjax.apps.simulate import SimulateOptions, simulate
 
     return simulate(SimulateOptions(**options)), True
+
+
+def _run_prepare(options):
+    from zestjax.apps.prepare import PrepareOptions, prepare
+
+    return prepare(PrepareOptions(**options)), True
 
 
 def _run_train(options):

@@ -5,10 +5,12 @@ unit      what is done again and again: a frame, a step; the first one compiles
 
 import sys
 import time
+from collections.abc import Iterable, Iterator, Sized
 
 from tqdm import tqdm
 
 from zestjax.apps.memory import peak_megabytes
+from zestjax.base.types import T
 
 LONG_SECONDS = 10.0  # that are left: who waits for less needs no estimate
 
@@ -45,10 +47,11 @@ def estimated(label, unit, each, seconds):
     return f"{label}: about {each:.2g} s a {unit}, {seconds:.0f} s in all{held}"
 
 
-def progress(items, label, *, quiet=False, unit=None):
-    """The items, with a bar that shows how long the rest takes; of a `unit` also an `Estimate` in words."""
+def progress(items: Iterable[T], label: str, *, quiet: bool = False, unit: str | None = None) -> Iterator[T]:
+    """The items, with a bar that shows how long the rest takes; of a `unit`, and a known number of them, also an
+    `Estimate` in words."""
     bar = tqdm(items, desc=label, disable=quiet, file=sys.stderr, leave=False)
-    if unit is None:
+    if unit is None or not isinstance(items, Sized):
         yield from bar
         return
     estimate, count = Estimate(label, unit, quiet=quiet), len(items)

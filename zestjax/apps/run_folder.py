@@ -38,16 +38,16 @@ class Restored(NamedTuple):
 
 
 @contextlib.contextmanager
-def held(out):
-    """Context: this process alone trains into the folder, which is made. The system lets go when the process dies.
+def held(out, *, doing="training"):
+    """Context: this process alone works on the folder, which is made. The system lets go when the process dies.
 
     Raises:
-      ValueError: another process trains into it.
+      ValueError: another process works on it; `doing` is what the message says it does.
     """
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     path = out / LOCK
-    file = _locked(path)
+    file = _locked(path, doing)
     try:
         for folder in (out, out / "checkpoints"):
             remove_parts(folder)
@@ -57,7 +57,7 @@ def held(out):
         file.close()
 
 
-def _locked(path):
+def _locked(path, doing):
     """The lock's open file; it says who holds it."""
     while True:
         file = path.open("a+")
@@ -68,7 +68,7 @@ def _locked(path):
             who = file.read().strip() or "another process"
             file.close()
             raise ValueError(
-                f"{path.parent}: {who} is training into it; wait for its end, or choose another --out."
+                f"{path.parent}: {who} is {doing} into it; wait for its end, or choose another --out."
             ) from error
         except OSError:  # a file system without locks: nothing can be held there
             return file

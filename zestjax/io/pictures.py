@@ -146,6 +146,11 @@ def write_image(path: FilePath, picture: Array) -> None:
     write_bytes(path, content.tobytes())
 
 
+def encoded_png(picture: Array) -> bytes:
+    """A (H, W, 3) picture as the bytes of a PNG; raises as `to_bytes`."""
+    return cv2.imencode(".png", to_bytes(picture)[..., ::-1])[1].tobytes()
+
+
 def to_bytes(picture: Array) -> np.ndarray:
     """Floats in [0, 1] (clipped) or booleans to uint8, rounded; uint8 is unchanged. Any leading axes.
 

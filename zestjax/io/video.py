@@ -9,6 +9,7 @@ temporary folder, by ASCII names.
 import contextlib
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -18,7 +19,9 @@ from zestjax.base.checks import check_shapes
 from zestjax.base.types import Array, FilePath
 from zestjax.io.files import write_bytes
 from zestjax.io.pictures import to_bytes
-from zestjax.io.reading import silenced_stderr
+from zestjax.io.reading import open_regular, silenced_stderr
+
+MOST_BYTES = 2**40  # of a video: only a frame of it is ever held
 
 
 def write_video(path_stem: FilePath, frames: Array, *, fps: float = 24) -> Path:
@@ -72,6 +75,26 @@ def read_video(path: FilePath) -> np.ndarray:
     return np.stack(frames)
 
 
+def video_frames(path: FilePath) -> Iterator[np.ndarray]:
+    """The frames of a video or an animated picture one after the other, (H, W, 3) uint8 RGB: only one is held.
+
+    Raises:
+      ValueError: at the first frame, if the file is missing or not a video that OpenCV reads.
+    """
+    with open_regular(path, most=MOST_BYTES):  # nothing but a file is handed to OpenCV, which would wait for a pipe
+        pass
+    with _ascii_folder() as folder:
+        link = folder / f"video{_suffix(path)}"
+        link.symlink_to(os.path.abspath(path))
+        with silenced_stderr():
+            frames = _each(link)
+            first = next(frames, None)
+        if first is None:
+            raise ValueError(f"{path}: is not a video that can be read; check the path and the format.")
+        yield first
+        yield from frames
+
+
 def _suffix(path):
     """A file's suffix, if it is ASCII."""
     suffix = Path(path).suffix
@@ -100,17 +123,24 @@ def _whole(path, count):
 
 def _decoded(path):
     """The frames of a file that OpenCV may be given; none of one that it cannot read."""
+    return list(_each(path))
+
+
+def _each(path):
+    """The same one by one."""
     if path.suffix in (".webp", ".gif"):
         done, animation = cv2.imreadanimation(str(path))
-        return [frame[..., 2::-1] for frame in animation.frames] if done else []
-    capture, frames = cv2.VideoCapture(str(path)), []
-    while True:
-        done, frame = capture.read()
-        if not done:
-            break
-        frames.append(frame[..., ::-1])
-    capture.release()
-    return frames
+        yield from ([frame[..., 2::-1] for frame in animation.frames] if done else [])
+        return
+    capture = cv2.VideoCapture(str(path))
+    try:
+        while True:
+            done, frame = capture.read()
+            if not done:
+                return
+            yield frame[..., ::-1]
+    finally:
+        capture.release()
 
 
 def _encode_webm(path, bgr, fps):
