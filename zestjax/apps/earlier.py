@@ -6,6 +6,7 @@ from typing import Any
 from zestjax.base.parts import from_stored
 from zestjax.fields.heads import Blend, Direct
 from zestjax.frames.analysis import OwnMaps
+from zestjax.frames.exposure import Gains
 from zestjax.frames.selection import KeyFrames, Slots
 from zestjax.systems import presets
 from zestjax.systems.fields import Dynamic, Static
@@ -109,7 +110,7 @@ def _system(c: Config, frames: bool) -> System:
         Space(c.planes, c.spacing, c.reference, "pooled" if frames else "strided"),
         Static(KeyFrames(c.key_frames, c.key_frame_choice), **shared), Dynamic(Slots(c.slots), reach=reach, **shared),
         Guided() if occupied else Even(c.samples), Density() if c.blend == "density" else Opacity(),
-        OwnMaps(c.evidence_planes, c.frame_widths) if frames else None, c.precision,
+        OwnMaps(c.evidence_planes, c.frame_widths) if frames else None, c.precision, Gains() if frames else None,
     )  # fmt: skip
     whole = whole if c.dynamic else presets.still(whole)
     whole = whole if c.geometry else presets.without_geometry_volume(whole)

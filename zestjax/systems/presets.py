@@ -75,7 +75,7 @@ def without_volumes(system: System) -> System:
 def _guided_or_even(system, **changes):
     """The system with fields changed; where no volume is left, rays are sampled evenly and no frame is asked."""
     if not any(reads_frames(changes.get(name, getattr(system, name))) for name in ("static", "dynamic")):
-        changes |= dict(frames=None, sampler=Even(SAMPLES) if system.sampler.guided else system.sampler)
+        changes |= dict(frames=None, exposure=None, sampler=Even(SAMPLES) if system.sampler.guided else system.sampler)
     return replace(system, **changes)
 
 
