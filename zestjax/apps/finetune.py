@@ -2,11 +2,15 @@
 
 A frame that is held back has no picture of its own time to be predicted from, as the views asked for later have: what
 moves would learn to fade. It is therefore left out, as far as the frames' own analysis finds it.
+
+judges   frames that no step learns from: what stands still in them is predicted at the start and at the end, and where
+         the end is worse the start's weights are what is returned
 """
 
 import dataclasses
 import functools
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import jax
@@ -16,11 +20,14 @@ import numpy as np
 from zestjax import novel_view
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.own_frames import known_of, own_frame_batches
+from zestjax.apps.results import write_record
 from zestjax.apps.scenes import digest, open_scene, place_of
 from zestjax.apps.train import run_name, summarise
 from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.base.parts import to_stored
+from zestjax.frames.assembly import colours_of, positions
 from zestjax.frames.known import answers_of
+from zestjax.io.weights import save_weights
 from zestjax.train.batches import step_batches
 from zestjax.train.learn import find_fault
 from zestjax.train.recipes import Cosine
@@ -31,6 +38,8 @@ STILL_WEIGHTS = dict(static_rec=20.0)
 MOVING = 0.3  # probability of moving from which a pixel is left out, and its surroundings with it
 LEAST_STILL = 0.01  # share of the pixels that must stand still: with less a run would learn from nothing, at loss 0
 FOREVER = 1_000_000
+JUDGES = 2  # frames: each costs two renderings
+LEAST_FRAMES = 8  # of a video that can spare them
 CHECKPOINT_SECONDS = 60.0  # the default budget: a run that asks for more loses at most this much to a kill
 
 
@@ -71,7 +80,9 @@ def finetune(options):
     video = opened.scene.video
     if len(video.images) - len(set(options.exclude)) < 3:
         raise ValueError(f"finetune: --exclude leaves too few of {len(video.images)} frames; leave at least 3.")
-    moving = moving_pixels(model, video, options.exclude)
+    prepared = novel_view.prepare(model.params, video, system=model.system, exclude=options.exclude)
+    moving = moving_pixels(prepared)
+    judges = () if moving is None else judging_frames(video, options.exclude)
     known = known_of(opened.scene)._replace(moving=moving)
     recipe = dataclasses.replace(model.recipe, rate=RATE)
     recipe = recipe.of(model.system, known=answers_of(known)) if moving is None else recipe.weighted(STILL_WEIGHTS)
@@ -92,20 +103,77 @@ def finetune(options):
         "scene": place_of(options.scene),
         "data": {"frames": digest(video), "exclude": list(options.exclude)},
     }  # fmt: skip
-    one_at = own_frame_batches(known, recipe, seed=options.seed, exclude=options.exclude)
+    one_at = own_frame_batches(known, recipe, seed=options.seed, exclude=options.exclude, kept=judges)
     batch_at = step_batches(one_at, recipe.clips)
     step_fn = jax.jit(step_fn, donate_argnums=(0, 1))
     result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata, explain=explain)
-    return summarise(result, options.out, "finetune")
+    summary = summarise(result, options.out, "finetune")
+    if not result.finished or not judges:
+        return summary
+    verdict = judged(model, result.state.params, prepared, moving, judges, options.exclude)
+    if verdict.worse:
+        save_weights(summary.weights, model.trained, metadata=metadata | {"step": 0, "seconds": 0.0})
+    write_record(options.out / "judged.json", verdict.told)
+    return summary._replace(line=f"{summary.line}; {verdict}")
 
 
-def moving_pixels(model, video, exclude):
+class Verdict(NamedTuple):
+    """frames: the judges. before, after: PSNR of what stands still in them, dB."""
+
+    frames: tuple[int, ...]
+    before: float
+    after: float
+
+    @property
+    def worse(self):
+        """Whether the start is the better one."""
+        return not self.after >= self.before
+
+    @property
+    def told(self):
+        """As JSON has it."""
+        return self._asdict() | {"kept": "start" if self.worse else "trained"}
+
+    def __str__(self):
+        ended = ", so that the start's weights are kept" if self.worse else ""
+        frames = " and ".join(map(str, self.frames))
+        return f"frames {frames}, held back: {self.before:.2f} -> {self.after:.2f} dB{ended}"
+
+
+def judging_frames(video, exclude):
+    """The frames that judge, those whose nearest other camera is farthest; none of a video that cannot spare them."""
+    usable = [i for i in range(len(video.images)) if i not in exclude]
+    if len(usable) < LEAST_FRAMES:
+        return ()
+    places = positions(video.cameras)[usable]
+    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    farthest = np.argsort(-apart.min(1), kind="stable")[:JUDGES]
+    return tuple(sorted(usable[i] for i in farthest))
+
+
+def judged(model, trained, prepared, moving, frames, exclude):
+    """The `Verdict` on parameters as of `model.trained`."""
+
+    def score(params):
+        errors = []
+        for i in frames:
+            camera = jax.tree.map(lambda leaf, i=i: jnp.asarray(leaf[i]), prepared.video.cameras)
+            view = novel_view.render_view(params, prepared, camera, i, system=model.system, exclude=(*exclude, i))
+            error = np.square(np.asarray(view.static) - colours_of(prepared.video.images[i])).mean(-1)
+            errors.append(error[~moving[i]])
+        return float(-10 * np.log10(max(np.concatenate(errors).mean(), 1e-10)))
+
+    return Verdict(frames, score(model.params), score(getattr(trained, "model", trained)))
+
+
+def moving_pixels(prepared):
     """(N, H, W) bool of what may move, by the frames' own analysis; None where the model has none.
 
     Raises:
       ValueError: hardly anything stands still.
     """
-    maps = novel_view.prepare(model.params, video, system=model.system, exclude=exclude).maps
+    maps, video = prepared.maps, prepared.video
     if maps is None:
         return None
     size = video.images.shape[2:0:-1]

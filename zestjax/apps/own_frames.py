@@ -29,7 +29,7 @@ def known_of(scene: Scene) -> KnownFrames:
     )
 
 
-def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
+def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=(), kept=()):
     """(step, draw=0) -> batch: a hole of the step's group, predicted from the frames that are neither holes nor
     excluded; of a system that reads no frames, any that is not excluded.
 
@@ -38,17 +38,19 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
       recipe: `Recipe`.
       seed: draws the holes and the rays.
       exclude: frames that serve nothing, not even as targets.
+      kept: frames that are no targets.
     """
     usable = np.array([i for i in range(len(known.images)) if i not in set(exclude)])
+    targets = np.array([i for i in usable if i not in set(kept)])
     cameras, maps = Camera(known.intrinsics, known.camera_from_world), recipe.system.frames
     gains = recipe.system.exposure
     seen = None if maps is None else footage(known.images)
 
     @functools.lru_cache(maxsize=16)
     def prepared(group):
-        size = min(HOLES, len(usable) - 2)
-        rounds, place = divmod(group * size, len(usable))
-        order = np.random.default_rng([seed, rounds]).permutation(usable)
+        size = min(HOLES, len(usable) - 2, len(targets))
+        rounds, place = divmod(group * size, len(targets))
+        order = np.random.default_rng([seed, rounds]).permutation(targets)
         holes = tuple(int(i) for i in np.roll(order, -place)[:size])
         evidence = exposure = None
         if maps is not None and seen is not None:
@@ -60,7 +62,7 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=()):
         return PreparedClip(known, evidence, holes, tuple(exclude), exposure=exposure)
 
     reading = any(map(reads_frames, (recipe.system.static, recipe.system.dynamic)))
-    by_heart = PreparedClip(known, None, (), tuple(exclude), tuple(map(int, usable)))
+    by_heart = PreparedClip(known, None, (), tuple(exclude), tuple(map(int, targets)))
 
     def batch_at(step, draw=0):
         chosen = prepared(step // STEPS_PER_HOLES) if reading else by_heart
