@@ -21,8 +21,8 @@ def filmed(places):
 
 
 def test_those_that_stand_apart_judge():
-    places = [0.0, 0.11, 0.21, 0.31, 0.7, 0.75, 0.8, 0.85, 1.5]
-    assert judging_frames(filmed(places), ()) == (0, 8)  # 0.11 and 0.65 from the next one
+    places = [0.0, 0.12, 0.23, 0.31, 0.39, 0.47, 0.55, 0.63, 1.5]
+    assert judging_frames(filmed(places), ()) == (0, 8)  # 0.12 and 0.87 from the next one
     assert judging_frames(filmed(places), (0,)) == (1, 8)
     assert judging_frames(filmed(places), (0, 1)) == ()
 

@@ -21,7 +21,7 @@ from zestjax.video import Inputs
 
 SURE = 0.5  # of a flow, there and back, whose pixels are compared
 INSIDE = (0.05, 0.95)  # colours whose ratio says something: darker ones are noise, brighter ones cut off
-LEAST_PAIRS = 0.2  # share of a picture that must be paired for a link: noise pairs with noise over a tenth
+LEAST_PAIRS = 0.2  # share of a picture that must be paired for a link: noise of 144 x 256 pairs with noise over a tenth
 
 
 class Exposure(NamedTuple):
