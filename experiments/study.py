@@ -86,7 +86,7 @@ def scored(system, name, options, **choices):
 
 def measured(system, options):
     """{"steps", "pace", and a table by kind of learning}."""
-    steps = max(PACE_STEPS, round(60 * options.minutes / pace(system, options)))
+    steps = options.steps or max(PACE_STEPS, round(60 * options.minutes / pace(system, options)))
     found = {"steps": steps, "pace": pace(system, options)}
     if options.learn == "others":
         return found | {"agnostic": scored(system, "others", options, steps=steps)}
@@ -131,7 +131,8 @@ HEAD = (
 def markdown(results, options):
     """Both tables."""
     shape = "x".join(map(str, options.size))
-    said = f"{options.minutes:g} minutes of stepping each, `{options.preset}`, {shape}, {len(options.scenes)} scenes"
+    budget = f"{options.steps} steps" if options.steps else f"{options.minutes:g} minutes of stepping"
+    said = f"{budget} each, `{options.preset}`, {shape}, {len(options.scenes)} scenes"
     kinds = {"agnostic": f"Never seen: {said}", "tuned": f"After {options.finetune} s on each scene"}
     parts = []
     for kind, title in kinds.items():
@@ -210,7 +211,13 @@ def study(options):
         write_bytes(options.out / "study.md", text.encode())
         print(text, flush=True)
     found = margins(results)
-    told = {"minutes": options.minutes, "size": options.size, "margins": found, "systems": results}
+    told = {
+        "minutes": options.minutes,
+        "steps": options.steps,
+        "size": options.size,
+        "margins": found,
+        "systems": results,
+    }
     write_record(options.out / "study.json", told)
     if found:
         draw(options.out / "margins.png", found)
@@ -225,6 +232,7 @@ def parsed(arguments=None):
     parser.add_argument("--scenes", nargs="+", default=list(BENCH), choices=BENCH)
     parser.add_argument("--preset", default="small")
     parser.add_argument("--minutes", type=float, default=10.0, help="of stepping, each system")
+    parser.add_argument("--steps", type=int, help="of each system, in place of equal minutes")
     parser.add_argument("--finetune", type=int, default=30, help="seconds on each scene; 0: no second table")
     parser.add_argument("--tuned", nargs="+", default=["zest", "mvsnerf", "svs", "nsff"], choices=SYSTEMS)
     parser.add_argument("--learn", choices=("simulated", "others"), default="simulated")
