@@ -90,14 +90,9 @@ def finetune(options):
     explain = functools.partial(find_fault, objective)
     params = jax.tree.map(jnp.array, model.trained)  # copies: the step donates
     loop = LoopOptions(
-        options.out,
-        options.steps,
-        options.budget,
-        options.resume,
-        CHECKPOINT_SECONDS,
-        quiet=options.quiet,
+        options.out, options.steps, options.budget, options.resume, CHECKPOINT_SECONDS, quiet=options.quiet,
         label="finetune",
-    )
+    )  # fmt: skip
     metadata = model.metadata | {
         "recipe": to_stored(recipe), "seed": options.seed, "start": run_name(model.path),
         "scene": place_of(options.scene),
@@ -111,9 +106,14 @@ def finetune(options):
     if not result.finished or not judges:
         return summary
     verdict = judged(model, result.state.params, prepared, moving, judges, options.exclude)
+    return _told(summary, verdict, model, metadata)
+
+
+def _told(summary, verdict, model, metadata):
+    """The summary with the verdict, which is stored beside the weights; these are the start's where it was better."""
     if verdict.worse:
         save_weights(summary.weights, model.trained, metadata=metadata | {"step": 0, "seconds": 0.0})
-    write_record(options.out / "judged.json", verdict.told)
+    write_record(summary.weights.parent / "judged.json", verdict.told)
     return summary._replace(line=f"{summary.line}; {verdict}")
 
 

@@ -81,7 +81,7 @@ def prepare(options):
             shutil.rmtree(work, ignore_errors=True)
             raise
         finally:
-            if not existed and not any(path.name != LOCK for path in out.iterdir()):
+            if not existed and not any(path.name != LOCK for path in out.glob("*")):
                 shutil.rmtree(out, ignore_errors=True)
 
 
@@ -92,7 +92,7 @@ def _check_place(source, out):
         raise ValueError(f"{out}: the source lies there, or it in the source; choose another --out.")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is a file; choose another --out.")
-    others = [p.name for p in out.iterdir() if p.name not in (WORK, LOCK)] if out.is_dir() else []
+    others = [p.name for p in out.glob("*") if p.name not in (WORK, LOCK)] if out.is_dir() else []
     if others and OURS not in others and not (out / WORK).is_dir():
         raise ValueError(f"{out}: holds files that `prepare` did not write; choose an empty or a new folder.")
 
@@ -100,9 +100,9 @@ def _check_place(source, out):
 def _identity(options, source):
     """What a run that goes on must share with the one before."""
     files = source.files or (source.path,)
-    found = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    found = [[path.name, path.stat().st_size, path.stat().st_mtime_ns] for path in files]
     told = {key: getattr(options, key) for key in ("frames", "height", "focal", "fov", "seed")}
-    return json.loads(json.dumps(told | {"source": str(resolved(source.path)), "files": found}))
+    return told | {"source": str(resolved(source.path)), "files": found}
 
 
 def _begin(work, identity):
@@ -253,11 +253,11 @@ def _publish(out, work):
     fresh, old, ready = work / "scene", work / "old", work / "ready"
     if not ready.exists():
         old.mkdir(exist_ok=True)
-        for path in sorted(out.iterdir(), key=lambda path: path.name != MARKER):
+        for path in sorted(out.glob("*"), key=lambda path: path.name != MARKER):
             if path.name not in (WORK, LOCK):
                 path.rename(old / path.name)
         write_bytes(ready, b"")
-    for path in sorted(fresh.iterdir(), key=lambda path: (path.name == MARKER, path.name)):
+    for path in sorted(fresh.glob("*"), key=lambda path: (path.name == MARKER, path.name)):
         if path.name != "done":
             path.rename(out / path.name)
     shutil.rmtree(work)
