@@ -10,6 +10,7 @@ import stage
 from stage import MINI
 
 from zestjax import novel_view
+from zestjax.apps.train import prepared_from_arrays
 from zestjax.base.parts import from_stored, to_stored
 from zestjax.frames.assembly import footage
 from zestjax.frames.exposure import Exposure, Gains, evened, exposed_as_target
@@ -170,3 +171,23 @@ def test_the_part_is_stored_and_old_files_have_none():
     stored = to_stored(ZEST)
     del stored["exposure"]
     assert from_stored(stored, PARTS).exposure is None
+
+
+def drifting_clip():
+    """The stage's clip, of 48 x 64 frames, with a drift that they tell themselves."""
+    images = stage.video((48, 64)).images * np.exp(DRIFT - DRIFT.max(0))[:, None, None]
+    return stage.clip()._replace(images=np.round(255 * images).astype(np.uint8))
+
+
+def test_a_system_that_asks_nothing_else_of_frames_has_them_evened_in_training_as_in_rendering():
+    alone = dataclasses.replace(stage.PAPER, exposure=Gains())
+    prepared = prepare_clip(jax.random.key(1), drifting_clip(), alone)
+    assert prepared.evidence is None and prepared.exposure.gains is not None
+    assert prepare_clip(jax.random.key(1), drifting_clip(), stage.PAPER).exposure is None
+
+
+def test_a_stored_clip_is_evened_as_the_system_has_it():
+    clip, gains = drifting_clip(), (DRIFT - DRIFT.mean(0)).astype(np.float32)
+    stored = {"holes": np.array([3]), "exposure_links": np.diff(gains, axis=0), "exposure_gains": gains}
+    found = prepared_from_arrays(jax.random.key(1), clip._asdict() | stored, stage.PAPER)
+    assert found.exposure is None  # it does not ask: prepared anew

@@ -21,10 +21,19 @@ def filmed(places):
 
 
 def test_those_that_stand_apart_judge():
+    still = np.zeros((9, *stage.SIZE), bool)
     places = [0.0, 0.12, 0.23, 0.31, 0.39, 0.47, 0.55, 0.63, 1.5]
-    assert judging_frames(filmed(places), ()) == (0, 8)  # 0.12 and 0.87 from the next one
-    assert judging_frames(filmed(places), (0,)) == (1, 8)
-    assert judging_frames(filmed(places), (0, 1)) == ()
+    assert judging_frames(filmed(places), still, ()) == (0, 8)  # 0.12 and 0.87 from the next one
+    assert judging_frames(filmed(places), still, (0,)) == (1, 8)
+    assert judging_frames(filmed(places), still, (0, 1)) == ()
+
+
+def test_a_frame_in_which_everything_moves_cannot_judge():
+    moving = np.zeros((10, *stage.SIZE), bool)
+    moving[9] = True
+    places = [*np.linspace(0, 0.5, 9), 2.0]
+    assert 9 not in judging_frames(filmed(places), moving, ()) != ()
+    assert judging_frames(filmed(places), np.ones_like(moving), ()) == ()
 
 
 def test_judges_are_no_targets_but_serve():

@@ -24,7 +24,7 @@ from zestjax.frames.exposure import Exposure, evened, exposed_as_target
 from zestjax.frames.inputs import check_exclude, check_inputs, check_view
 from zestjax.rays import pixel_grid
 from zestjax.systems.system import Params, System
-from zestjax.systems.targets import target_inputs
+from zestjax.systems.targets import asks_for_own_time, target_inputs
 from zestjax.video import Inputs, Video
 
 BLOCK_ROWS = 8  # at most so many rows are rendered together, so that memory does not grow with the image
@@ -193,9 +193,7 @@ def _exposure_without(prepared, exclude, system):
 def _stand_in(prepared, time, exclude, system):
     """(`Video`, `Footage`) where the frame of the target's time may not be read, and is made of its neighbours; None
     where it may, where nothing is known of it, or nobody asks for it."""
-    if traced((prepared, time)) or time not in exclude or system.frames is None or system.dynamic is None:
-        return None
-    if 0 not in getattr(system.dynamic.frames, "offsets", ()):
+    if traced((prepared, time)) or time not in exclude or system.frames is None or not asks_for_own_time(system):
         return None
     with jax.ensure_compile_time_eval():  # the video is known also where a camera is traced
         return with_stand_in(prepared.video, prepared.footage, time, exclude=exclude)

@@ -28,6 +28,7 @@ from zestjax.base.parts import to_stored
 from zestjax.frames.assembly import colours_of, positions
 from zestjax.frames.known import answers_of
 from zestjax.io.weights import save_weights
+from zestjax.train.adversary import Opponents
 from zestjax.train.batches import step_batches
 from zestjax.train.learn import find_fault
 from zestjax.train.recipes import Cosine
@@ -82,7 +83,7 @@ def finetune(options):
         raise ValueError(f"finetune: --exclude leaves too few of {len(video.images)} frames; leave at least 3.")
     prepared = novel_view.prepare(model.params, video, system=model.system, exclude=options.exclude)
     moving = moving_pixels(prepared)
-    judges = () if moving is None else judging_frames(video, options.exclude)
+    judges = () if moving is None else judging_frames(video, moving, options.exclude)
     known = known_of(opened.scene)._replace(moving=moving)
     recipe = dataclasses.replace(model.recipe, rate=RATE)
     recipe = recipe.of(model.system, known=answers_of(known)) if moving is None else recipe.weighted(STILL_WEIGHTS)
@@ -140,9 +141,10 @@ class Verdict(NamedTuple):
         return f"frames {frames}, held back: {self.before:.2f} -> {self.after:.2f} dB{ended}"
 
 
-def judging_frames(video, exclude):
-    """The frames that judge, those whose nearest other camera is farthest; none of a video that cannot spare them."""
-    usable = [i for i in range(len(video.images)) if i not in exclude]
+def judging_frames(video, moving, exclude):
+    """The frames that judge, those whose nearest other camera is farthest, of all in which enough stands still; none of
+    a video that cannot spare them."""
+    usable = [i for i in range(len(video.images)) if i not in exclude and not moving[i].mean() > 1 - LEAST_STILL]
     if len(usable) < LEAST_FRAMES:
         return ()
     places = positions(video.cameras)[usable]
@@ -164,7 +166,7 @@ def judged(model, trained, prepared, moving, frames, exclude):
             errors.append(error[~moving[i]])
         return float(-10 * np.log10(max(np.concatenate(errors).mean(), 1e-10)))
 
-    return Verdict(frames, score(model.params), score(getattr(trained, "model", trained)))
+    return Verdict(frames, score(model.params), score(trained.model if isinstance(trained, Opponents) else trained))
 
 
 def moving_pixels(prepared):

@@ -43,8 +43,9 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=(), kept=()):
     usable = np.array([i for i in range(len(known.images)) if i not in set(exclude)])
     targets = np.array([i for i in usable if i not in set(kept)])
     cameras, maps = Camera(known.intrinsics, known.camera_from_world), recipe.system.frames
-    gains = recipe.system.exposure
-    seen = None if maps is None else footage(known.images)
+    gains, reading = recipe.system.exposure, any(map(reads_frames, (recipe.system.static, recipe.system.dynamic)))
+    seen = footage(known.images) if reading and (maps or gains) else None
+    links = gains(seen, exclude=exclude) if gains and seen else None
 
     @functools.lru_cache(maxsize=16)
     def prepared(group):
@@ -52,16 +53,14 @@ def own_frame_batches(known: KnownFrames, recipe, *, seed, exclude=(), kept=()):
         rounds, place = divmod(group * size, len(targets))
         order = np.random.default_rng([seed, rounds]).permutation(targets)
         holes = tuple(int(i) for i in np.roll(order, -place)[:size])
-        evidence = exposure = None
+        evidence, missing = None, (*holes, *exclude)
+        exposure = gains(seen, exclude=missing, known=links) if gains and seen else None
         if maps is not None and seen is not None:
-            missing = (*holes, *exclude)
-            exposure = None if gains is None else gains(seen, exclude=missing)
             evidence = video_evidence(
                 evened(seen, exposure), cameras, known.near, known.far, planes=maps.planes, exclude=missing
             )
         return PreparedClip(known, evidence, holes, tuple(exclude), exposure=exposure)
 
-    reading = any(map(reads_frames, (recipe.system.static, recipe.system.dynamic)))
     by_heart = PreparedClip(known, None, (), tuple(exclude), tuple(map(int, targets)))
 
     def batch_at(step, draw=0):

@@ -76,8 +76,8 @@ def frame_maps(video, cameras, flows):
     maps = jax.tree.map(np.asarray, novel_view.prepare(model.params, video, system=model.system).maps)
     size = video.images.shape[1:3]
     learned = np.stack([_grown(logit, size, 2) > 0 for logit in maps.moving_logits])
-    nearness = np.stack([_grown(coordinate, size, 4) for coordinate in maps.coordinate])
-    disparity = 1 / video.near + nearness * (1 / video.far - 1 / video.near)
+    coordinate = np.stack([_grown(own, size, 4) for own in maps.coordinate])
+    disparity = 1 / video.near + coordinate * (1 / video.far - 1 / video.near)
     both = np.stack([cleaned(a | b) for a, b in zip(moving, learned, strict=True)])
     return Maps(both, disparity.astype(np.float32))
 

@@ -26,6 +26,7 @@ from zestjax.base.parts import to_stored
 from zestjax.frames.evidence import Evidence
 from zestjax.frames.exposure import Exposure
 from zestjax.frames.known import answers_of, shared
+from zestjax.systems.presets import ZEST
 from zestjax.train.batches import (
     PreparedClip,
     batch_from_clip,
@@ -266,9 +267,12 @@ class _SimulatedBatches:
 
 
 def prepared_from_arrays(key, arrays, system):
-    """`PreparedClip` of a stored clip, with its evidence if that was stored too; `key` draws the holes if not."""
+    """`PreparedClip` of a stored clip, with its evidence if that was stored too, and of frames evened as the system has
+    them; `key` draws the holes if not."""
     clip = clip_from_arrays(arrays)
-    if "holes" not in arrays:
+    links, gains = (arrays.get(EXPOSURE + name) for name in Exposure._fields)
+    as_stored = system.exposure == ZEST.exposure or (system.exposure is None and gains is None)
+    if "holes" not in arrays or not as_stored:
         return prepare_clip(key, clip, system)
     evidence = lambda before: Evidence(**{name: arrays[before + name] for name in Evidence._fields})
     stand_ins = None
@@ -276,6 +280,5 @@ def prepared_from_arrays(key, arrays, system):
         plain = {name: arrays[STAND_IN + name] for name in StandIns._fields[:-1]}
         stand_ins = StandIns(evidence=evidence(STAND_IN + EVIDENCE), **plain)
     holes = tuple(int(i) for i in arrays["holes"])
-    links, gains = (arrays.get(EXPOSURE + name) for name in Exposure._fields)
     exposure = None if links is None else Exposure(links, gains)
     return PreparedClip(clip, evidence(EVIDENCE), holes, stand_ins=stand_ins, exposure=exposure)

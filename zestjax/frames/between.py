@@ -11,7 +11,6 @@ from collections.abc import Collection
 from typing import Any, NamedTuple
 
 import cv2
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -113,7 +112,7 @@ def with_stand_in(
     camera = camera_between(taken(video.cameras, found.before), taken(video.cameras, found.after), found.share)
     images = np.array(video.images)
     images[time] = as_bytes(found.image) if images.dtype == np.uint8 else found.image
-    cameras = jax.tree.map(lambda leaf, new: _replaced(leaf, time, new), video.cameras, camera)
+    cameras = with_camera(video.cameras, time, camera)
     return video._replace(images=images, cameras=cameras), _footage_around(images, seen, time)
 
 
@@ -129,7 +128,9 @@ def _footage_around(images, seen, time):
     return Footage(half, VideoFlow(flow, sure))
 
 
-def _replaced(leaf, index, value):
-    leaf = np.array(leaf)
-    leaf[index] = value
-    return leaf
+def with_camera(cameras: Camera, index: int, camera: Camera) -> Camera:
+    """`Camera` (N, ...) on the host, one of them replaced."""
+    found = Camera(*(np.array(leaf) for leaf in cameras))
+    for leaf, new in zip(found, camera, strict=True):
+        leaf[index] = new
+    return found

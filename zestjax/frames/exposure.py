@@ -52,13 +52,13 @@ class Gains:
         """
         half = np.asarray(seen.half)
         count, used = len(half), [i for i in range(len(half)) if i not in exclude]
-        blank = np.full((count - 1, 3), np.nan, np.float32)
-        links = np.array([_link(half, seen, i, i + 1) for i in range(count - 1)]) if known is None else known.links
+        fresh = lambda: np.array([_link(half, seen, i, i + 1) for i in range(count - 1)]).reshape(-1, 3)
+        links = fresh() if known is None else known.links
         pairs = list(zip(used, used[1:], strict=False))
         steps = [links[i] if j == i + 1 else _link(half, seen, i, j) for i, j in pairs]
         found = np.cumsum([np.zeros(3), *steps], axis=0)
         if not steps or not np.ptp(found, axis=0).max() >= np.log1p(self.least):  # also of NaN
-            return Exposure(links if count > 1 else blank, None)
+            return Exposure(links, None)
         gains = np.stack([np.interp(np.arange(count), used, channel) for channel in found.T], axis=-1)
         return Exposure(links, (gains - gains.mean(0)).astype(np.float32))
 

@@ -67,6 +67,11 @@ def target_inputs(
     return inputs, (jnp if traced(frames) else np).concatenate(frames)
 
 
+def asks_for_own_time(system: System) -> bool:
+    """Whether a system has a slot for the frame of the target's own time."""
+    return system.dynamic is not None and 0 in getattr(system.dynamic.frames, "offsets", ())
+
+
 def _number(x):
     """() float32 of what is known, and of what is traced as JAX has it."""
     return jnp.asarray(x).astype(jnp.float32) if traced(x) else np.float32(x)

@@ -23,7 +23,7 @@ from zestjax.systems.system import System
 from zestjax.systems.targets import target_inputs
 from zestjax.train.measures import Known, Truth
 from zestjax.train.recipes import Recipe
-from zestjax.train.stand_ins import StandIns, find_stand_ins, slots_evidence, stand_in_at
+from zestjax.train.stand_ins import StandIns, find_stand_ins, looks, slots_evidence, stand_in_at
 from zestjax.video import Inputs, Video
 
 HOLES = 2  # of a clip's frames: a third of the targets then have no frame of their own time
@@ -82,14 +82,16 @@ def prepare_clip(key: jax.Array, clip: Clip, system: System) -> PreparedClip:
     """
     count = len(clip.images)
     holes = tuple(int(i) for i in jax.random.choice(key, count, (min(HOLES, count // 5),), replace=False))
-    if system.frames is None:
+    if system.frames is None and system.exposure is None:
         return PreparedClip(clip, None, holes)
     cameras, seen = Camera(clip.intrinsics, clip.camera_from_world), footage(clip.images)
-    planes, video = system.frames.planes, Video(clip.images, cameras, clip.near, clip.far)
     exposure = None if system.exposure is None else system.exposure(seen, exclude=holes)
+    if system.frames is None:
+        return PreparedClip(clip, None, holes, exposure=exposure)
+    planes, video = system.frames.planes, Video(clip.images, cameras, clip.near, clip.far)
     even = evened(seen, exposure)
     evidence = video_evidence(even, cameras, clip.near, clip.far, planes=planes, exclude=holes)
-    stand_ins = find_stand_ins(video, seen, holes, planes=planes, exposure=exposure)
+    stand_ins = find_stand_ins(video, seen, holes if looks(system) else (), planes=planes, exposure=exposure)
     return PreparedClip(clip, evidence, holes, stand_ins=stand_ins, exposure=exposure)
 
 
@@ -156,11 +158,9 @@ def batch_from_clip(key: jax.Array, prepared: PreparedClip, recipe: Recipe, *, s
     shown = _shown(clip, kind, index)
     inputs, evidence, frames = _inputs_of(prepared, shown["camera"], time, system)
     batch = Batch(inputs, evidence, _rays_of(shown, draw, recipe, step))
-    return (
-        batch
-        if isinstance(clip, KnownFrames)
-        else batch._replace(**_planes_of(clip, shown, frames, inputs, system, holes))
-    )
+    if isinstance(clip, KnownFrames):
+        return batch
+    return batch._replace(**_planes_of(clip, shown, frames, inputs, system, holes))
 
 
 def _inputs_of(prepared, camera, time, system):

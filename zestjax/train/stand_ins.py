@@ -13,10 +13,11 @@ import numpy as np
 
 from zestjax.cameras import Camera
 from zestjax.frames.assembly import Footage, video_evidence
-from zestjax.frames.between import with_stand_in
+from zestjax.frames.between import with_camera, with_stand_in
 from zestjax.frames.evidence import Evidence
 from zestjax.frames.exposure import Exposure, evened
 from zestjax.systems.system import System
+from zestjax.systems.targets import asks_for_own_time
 from zestjax.video import Video
 
 REACH = 2  # frames on either side of a time that are kept: as far as `Slots` look by default
@@ -80,6 +81,12 @@ def _stand_in(video, seen, time, holes, planes, exposure):
     return StandIns(times=np.int64(time), images=np.asarray(shown.images)[time], evidence=of_all, **pose)
 
 
+def looks(system: System) -> bool:
+    """Whether a system would look at a frame that stands in, and at no frame farther off than are kept."""
+    field = system.dynamic
+    return field is not None and asks_for_own_time(system) and max(map(abs, field.frames.offsets)) <= REACH
+
+
 def stand_in_at(
     found: StandIns | None, time: int, images: np.ndarray, cameras: Camera, *, system: System
 ) -> Standing | None:
@@ -92,15 +99,13 @@ def stand_in_at(
       cameras: `Camera` (N, ...).
       system: `System`.
     """
-    offsets = () if system.dynamic is None else getattr(system.dynamic.frames, "offsets", ())
-    if found is None or not np.any(found.times == time) or 0 not in offsets or max(map(abs, offsets)) > REACH:
+    if found is None or not np.any(found.times == time) or not looks(system):
         return None
     row = int(np.argmax(found.times == time))
-    images, leaves = np.array(images), [np.array(leaf) for leaf in cameras]
+    images = np.array(images)
     images[time] = found.images[row]
-    for leaf, new in zip(leaves, (found.intrinsics[row], found.camera_from_world[row]), strict=True):
-        leaf[time] = new
-    return Standing(images, Camera(*leaves), row, time)
+    camera = Camera(found.intrinsics[row], found.camera_from_world[row])
+    return Standing(images, with_camera(cameras, time, camera), row, time)
 
 
 def slots_evidence(found: StandIns, standing: Standing, frames: np.ndarray) -> Evidence:
