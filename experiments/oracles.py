@@ -9,7 +9,9 @@ both       both
 blend      the picture is the dynamic field's where the target truly moves, the static field's elsewhere
 
 Beside it, how far the frames' own answers are off: the depth of what moves and of what stands still, in shares of the
-way from near to far (inverse depth), and the moving pixels' intersection over union.
+way from near to far (inverse depth), and the moving pixels' intersection over union. `flow` and `along` are the depth
+of what moves by the optical flow alone: to the two neighbours, and along a point's path (`zestjax.frames.along`), where
+the mean gap of 5 x 5 cells is least.
 """
 
 import argparse
@@ -19,18 +21,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import uniform_filter
 
 from zestjax import novel_view
 from zestjax.apps.commands import numbers, size
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import score_image
 from zestjax.apps.weights import open_weights
+from zestjax.frames.assembly import footage, video_evidence
+from zestjax.frames.exposure import evened
 from zestjax.simulate.bench import BENCH, bench_scene
 from zestjax.simulate.footage import answers
 from zestjax.train.batches import _cells, _half_mask
 
 CERTAIN = 8.0  # logit of a true mask
 ORDER = ("own", "depth", "mask", "both", "blend")
+AROUND = 5  # cells that a gap is averaged over, as the analysis of frames does
 SHARP = 0.7  # planes within which a true depth lies, the least that a frame's own may say
 
 
@@ -80,11 +86,22 @@ def scored(model, name, options):
                 moves: Any = view.dynamic
                 blend = np.where(np.asarray(target.dynamic)[..., None], moves, view.static)
                 rows.setdefault("blend", []).append(_psnr(blend, target))
-    error = np.abs(np.asarray(own.coordinate) - coordinate)
+    error, by_flow = np.abs(np.asarray(own.coordinate) - coordinate), _by_flow(model, video, coordinate, moving)
     found = np.asarray(own.moving_logits) > 0
     overlap = np.sum(found & (half > 0.5)) / max(np.sum(found | (half > 0.5)), 1)
     mean = lambda x: float(x.mean()) if x.size else float("nan")
-    return rows, (mean(error[moving]), mean(error[~moving]), float(overlap))
+    return rows, (mean(error[moving]), mean(error[~moving]), float(overlap), *by_flow)
+
+
+def _by_flow(model, video, coordinate, moving):
+    """How far the depth of what moves is off by the flow to the neighbours, and along a point's path."""
+    seen = footage(video.images)
+    exposure = model.system.exposure and model.system.exposure(seen)
+    planes = model.system.frames.planes
+    found = video_evidence(evened(seen, exposure), video.cameras, video.near, video.far, planes=planes)
+    for gaps in (found.moving, found.moving_along):
+        around = uniform_filter(gaps.astype(np.float32), AROUND, axes=(1, 2))
+        yield float(np.abs(around.argmin(-1) / (planes - 1) - coordinate)[moving].mean())
 
 
 def _psnr(image, target):
@@ -101,18 +118,21 @@ def main():
     parser.add_argument("--targets", type=numbers, default=(2, 6, 10, 14, 18, 22))
     parser.add_argument("--size", type=size, default=(144, 256))
     options = parser.parse_args()
-    model, total = open_weights(options.weights), {}
-    print("| scene | own | depth | mask | both | blend | depth off: moving | static | mask IoU |\n" + "|---" * 9 + "|")
+    model, total, off = open_weights(options.weights), {}, []
+    print("| scene | own | depth | mask | both | blend | depth off: moving | static | mask IoU | flow | along |")
+    print("|---" * 11 + "|")
     said = lambda row: " / ".join("–" if np.isnan(x) else f"{x:.2f}" for x in row)
     for name in options.scenes:
         rows, errors = scored(model, name, options)
         means = {oracle: np.mean(found, 0) for oracle, found in rows.items()}
         for oracle, mean in means.items():
             total.setdefault(oracle, []).append(mean)
+        off.append(errors)
         columns = [said(means[oracle]) for oracle in ORDER] + [f"{x:.3f}" for x in errors]
         print(f"| {name} | {' | '.join(columns)} |", flush=True)
+    errors = [f"{x:.3f}" for x in np.nanmean(off, 0)]
     means = [said(np.nanmean(total[oracle], 0)) for oracle in ORDER]
-    print(f"| mean | {' | '.join(means)} | | | |")
+    print(f"| mean | {' | '.join(means)} | {' | '.join(errors)} |")
 
 
 if __name__ == "__main__":

@@ -69,7 +69,7 @@ def test_moments_match_finite_differences(x64):
 
 def evidence(seed=0, frames=3, planes=6):
     draw = lambda c: np.random.default_rng(seed).uniform(size=(frames, 4, 6, c)).astype(np.float32)
-    return Evidence(*(draw(n) for n in (planes, planes, planes, planes, FLOW_CHANNELS, 2, 12)))
+    return Evidence(*(draw(n) for n in (*(planes,) * 6, FLOW_CHANNELS, 2, 12)))
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_low_cost_at_a_plane_is_a_surface_there_before_anything_is_learned(analy
     """With a net that says nothing, the surface is the plane that the costs, and what is below, speak for."""
     params = jax.tree.map(jnp.zeros_like, analysed[0])
     found = evidence()._replace(
-        **{name: jnp.asarray(evidence()[0]).at[..., 2].set(0) for name in ("static", "best", "still")}
+        **{name: jnp.asarray(evidence()[0]).at[..., 2].set(0) for name in ("static", "best", "still", "still_along")}
     )
     maps = jax.jit(frame_maps)(params, found)
     np.testing.assert_array_equal(maps.logits.argmax(-1), 2)

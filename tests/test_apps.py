@@ -12,6 +12,7 @@ import stage
 from zestjax.apps import paths, scoring, stereo, tables, train
 from zestjax.cameras import Camera, project, rigid_inverse, unproject
 from zestjax.frames.known import known_frames
+from zestjax.io.reading import FileWarning
 from zestjax.video import Video
 
 
@@ -130,6 +131,91 @@ def test_time_stands_still_in_a_freeze_and_runs_in_an_orbit(video):
     assert orbit.times[0] == 0 and orbit.times[-1] == 11 and (np.diff(orbit.times) >= 0).all()
     centres = np.asarray(rigid_inverse(orbit.cameras.camera_from_world))[:, :3, 3]
     assert np.ptp(centres[:, 1]) > 0.02, "the camera circles, though the rig is a line"
+
+
+def test_a_fixed_camera_stands_still_while_time_runs_once(video):
+    path = paths.camera_path("fixed", video)
+    np.testing.assert_array_equal(path.times, np.arange(12))
+    assert np.ptp(path.cameras.camera_from_world, axis=0).max() < 1e-6
+
+
+def test_a_stabilised_path_is_the_videos_own_without_its_jumps(video):
+    path = paths.camera_path("stabilised", video)
+    np.testing.assert_array_equal(path.times, np.arange(12))
+    x, own = path.cameras.camera_from_world[:, 0, 3], video.cameras.camera_from_world[:, 0, 3]
+    assert np.abs(np.diff(x)).max() < 0.2 * np.abs(np.diff(own)).max()
+    assert own.min() < x.min() and x.max() < own.max()
+
+
+def test_space_time_runs_circles_while_time_stands_and_runs_on(video):
+    path = paths.camera_path("space-time", video)
+    places = np.asarray(rigid_inverse(path.cameras.camera_from_world))[:, :3, 3]
+    assert len(path.times) == 36 and path.times[0] == 0 and path.times[-1] == 11
+    assert (path.times[12:24] == 6).all() and np.ptp(places[12:24, 1]) > 0.02
+    assert (np.diff(path.times) >= 0).all() and np.ptp(places[:12, 1]) < 1e-6 and np.ptp(places[24:, 1]) < 1e-6
+
+
+def test_a_dolly_zoom_comes_nearer_and_the_middle_depth_keeps_its_size(video):
+    path = paths.camera_path("dolly", video)
+    depth = 2 / (1 / 2 + 1 / 8)
+    places = np.asarray(rigid_inverse(path.cameras.camera_from_world))[:, :3, 3]
+    assert places[0, 2] < 1e-6 and np.ptp(places[:, 2]) == pytest.approx(paths.CLOSER * depth, rel=1e-3)
+    at = lambda z: np.array([[places[0, 0] + x, 0, z] for x in (-0.1, 0.1)], np.float32)
+    size = lambda i, z: np.ptp(
+        project(Camera(*(jnp.asarray(leaf[i]) for leaf in path.cameras)), jnp.asarray(at(z))).pixels[:, 0]
+    )
+    np.testing.assert_allclose(size(12, depth), size(0, depth), rtol=1e-4)
+    assert size(12, 8) < 0.95 * size(0, 8)
+
+
+def studio_file(tmp_path, video, *, transform=None, scale=1.0, **more):
+    """nerfstudio's file of the video's first three cameras, as its viewer writes it, in its world: the data's, turned
+    by `transform` and then scaled."""
+    world = np.asarray(rigid_inverse(video.cameras.camera_from_world), np.float64)[:3]
+    world = world @ np.diag([1, -1, -1, 1])  # OpenGL's axes
+    if transform is not None:
+        world = np.concatenate([transform, [[0, 0, 0, 1]]]) @ world
+        world[:, :3, 3] *= scale
+        told = {"transform": transform.tolist(), "scale": scale}
+        (tmp_path / "dataparser_transforms.json").write_text(json.dumps(told))
+    fov = float(np.degrees(2 * np.arctan(12 / 40)))  # 24 rows, focal length 40
+    poses = [{"camera_to_world": pose.ravel().tolist(), "fov": fov, "aspect": 4 / 3} for pose in world]
+    for i, pose in enumerate(poses):
+        pose.update({name: value[i] for name, value in more.items()})
+    told = {"camera_type": "perspective", "render_height": 24, "render_width": 32, "fps": 24, "seconds": 4}
+    (tmp_path / "camera_path.json").write_text(json.dumps(told | {"camera_path": poses, "keyframes": []}))
+    return str(tmp_path / "camera_path.json")
+
+
+def test_a_path_of_nerfstudio_is_read_in_the_scenes_own_world(tmp_path, video):
+    turn = np.array([[0, 0, 1, 0.3], [1, 0, 0, -0.2], [0, 1, 0, 0.7]])
+    read = paths.camera_path(studio_file(tmp_path, video, transform=turn, scale=0.37), video)
+    np.testing.assert_allclose(read.cameras.camera_from_world, video.cameras.camera_from_world[:3], atol=1e-5)
+    np.testing.assert_allclose(read.cameras.intrinsics, video.cameras.intrinsics[:3], rtol=1e-5)
+    np.testing.assert_array_equal(read.times, [0, 4, 8])
+
+
+def test_a_path_of_nerfstudio_without_its_world_says_what_it_is_taken_for(tmp_path, video):
+    file = studio_file(tmp_path, video, render_time=[0.0, 0.5, 1.0])
+    with pytest.warns(FileWarning, match="taken to be in the scene's own"):
+        read = paths.camera_path(file, video)
+    np.testing.assert_allclose(read.cameras.camera_from_world, video.cameras.camera_from_world[:3], atol=1e-5)
+    np.testing.assert_array_equal(read.times, [0, 6, 11])
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"fov": [50, 200, 50]}, "between 0 and 180"), ({"fov": [50, "wide", 50]}, "fov"),
+        ({"camera_to_world": [[1.0] * 12] * 3}, "16 numbers"), ({"render_time": [0, 1, 2]}, "0 to 1"),
+        ({"camera_to_world": [[0.0] * 16] * 3}, "camera_path.json"),
+    ],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore::zestjax.io.reading.FileWarning")
+def test_a_bad_path_of_nerfstudio_is_one_error_that_names_the_file(tmp_path, video, more, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        paths.camera_path(studio_file(tmp_path, video, **more), video)
+    assert "camera_path.json: " in str(caught.value)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".json"])

@@ -11,7 +11,7 @@ from oracles import assert_grads_match, normal, uniform, value_and_gradients
 
 from zestjax.frames import cells as cells_module
 from zestjax.frames import evidence, optical_flow
-from zestjax.frames.evidence import FLOW_RANGE, GAP, TRUNCATION, MatchingViews, Neighbours
+from zestjax.frames.evidence import FLOW_RANGE, GAP, TRUNCATION, Along, MatchingViews, Neighbours
 from zestjax.planesweep import plane_depths
 
 pooled = jax.jit(cells_module.pooled, static_argnums=1)
@@ -194,18 +194,18 @@ def found():
     taken = lambda frames: jax.tree.map(lambda x: x[np.array(frames)], video.cameras)
     find = jax.jit(functools.partial(evidence.frame_evidence, planes=9))
     camera = jax.tree.map(lambda x: x[2], video.cameras)
-    far = [0, 1, 3, 4, 5]
+    far, path = [0, 1, 3, 4, 5], np.ones((2, 8, 12, 9), np.float32)
     run = lambda known, near: find(
         half[2], camera, MatchingViews(half[np.array(far)], taken(far), known * np.ones(5, np.float32)),
-        Neighbours(flow.flow[2], near * flow.sure[2], taken([3, 1])), stage.NEAR, stage.FAR,
+        Neighbours(flow.flow[2], near * flow.sure[2], taken([3, 1])), Along(*path), stage.NEAR, stage.FAR,
     )  # fmt: skip
     return run
 
 
 def test_the_wall_is_at_its_plane_by_colour_and_by_flow(found):
     parts = jax.tree.map(np.asarray, found(1, 1))
-    assert all(cost.shape == (8, 12, 9) for cost in parts[:4])
-    assert [x.shape[-1] for x in parts[4:]] == [evidence.FLOW_CHANNELS, 2, 12]
+    assert all(cost.shape == (8, 12, 9) for cost in parts[:6])
+    assert [x.shape[-1] for x in parts[6:]] == [evidence.FLOW_CHANNELS, 2, 12]
     depths = np.asarray(plane_depths(stage.NEAR, stage.FAR, 9, spacing="inverse"))
     wall = int(np.argmin(np.abs(1 / depths - 1 / stage.WALL)))
     _, _, card, _ = stage.shot(stage.PLACES[2], 2, (32, 48))
@@ -221,7 +221,7 @@ def test_evidence_is_in_range_and_without_sources_it_says_nothing(found):
     for part in found(1, 1):
         assert (part >= 0).all() and (part <= 1).all()
     nothing = found(0, 0)
-    for cost in nothing[:4]:
+    for cost in nothing[:6]:
         np.testing.assert_array_equal(cost, 1)
     np.testing.assert_array_equal(nothing.flow, 0.5)
     np.testing.assert_array_equal(nothing.sure, 0)

@@ -37,7 +37,7 @@ def evidence_of(system=MINI, seed=0):
     draw = lambda *s: np.random.default_rng(seed).integers(0, 256, s).astype(np.uint8)
     views = system.static.frames.count + (0 if system.dynamic is None else system.dynamic.frames.count)
     planes = system.frames.planes
-    return Evidence(*(draw(views, 4, 6, n) for n in (planes, planes, planes, planes, FLOW_CHANNELS, 2, 12)))
+    return Evidence(*(draw(views, 4, 6, n) for n in (*(planes,) * 6, FLOW_CHANNELS, 2, 12)))
 
 
 def rendered(params, inputs, evidence, system=MINI):

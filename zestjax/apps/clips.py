@@ -53,8 +53,9 @@ def clip_folder(spec, *, root=None):
 
 def evidence_folder(folder, planes):
     """Where the evidence of a folder's clips lies: by planes and by the code that finds it."""
-    parts = ("frames/evidence", "frames/cells", "frames/optical_flow", "frames/assembly", "frames/selection",
-             "frames/between", "frames/exposure", "train/stand_ins", "planesweep", "resample", "cameras")  # fmt: skip
+    parts = ("frames/along", "frames/evidence", "frames/cells", "frames/optical_flow", "frames/assembly",
+             "frames/selection", "frames/between", "frames/exposure", "train/stand_ins", "planesweep", "resample",
+             "cameras")  # fmt: skip
     code = code_digest(*(f"{name}.py" for name in parts))
     return Path(folder) / f"evidence-{planes}-{code}"
 

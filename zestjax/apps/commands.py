@@ -116,7 +116,11 @@ def _finetune(commands):
 def _render(commands):
     command = _command(commands, "render", "a camera path through a scene", _run_render)
     _scene_flags(command)
-    command.add_argument("--path", default="orbit", help="orbit, spiral, wander, freeze, frames, or a file")
+    command.add_argument(
+        "--path",
+        default="orbit",
+        help="orbit, spiral, wander, freeze, fixed, stabilised, space-time, dolly, frames, or a file",
+    )
     command.add_argument("--frames", type=positive, help="of the path (default: twice the video's)")
     command.add_argument("--budget-seconds", type=positive_float, metavar="S", help="for all frames: renders smaller")
     command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")

@@ -1,10 +1,15 @@
-"""Weights that zestjax 0.1 wrote: their flat configuration as a recipe, and today's names of their arrays."""
+"""Weights of earlier versions: the flat configuration of 0.1 as a recipe, today's names of its arrays, and arrays whose
+meaning has grown."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from zestjax.base.parts import from_stored
 from zestjax.fields.heads import Blend, Direct
+from zestjax.frames import analysis
 from zestjax.frames.analysis import OwnMaps
 from zestjax.frames.exposure import Gains
 from zestjax.frames.selection import KeyFrames, Slots
@@ -29,6 +34,13 @@ RENAMED = {
     ".dynamic.": ".dynamic.net.",
 }
 """What a name began with, and begins with now; the first that fits counts."""
+
+
+STILL, MOVING = (0, 1, 2), (0,)
+"""Costs of standing still and of moving, of twice as many with their surroundings, that frames had before they were
+followed along the flow (`frames.along`), by their place among today's."""
+_NOW = (analysis.STILL_COSTS // 2, analysis.MOVING_COSTS // 2)
+_REST = 4 + analysis.FLOW_CHANNELS + 2 + 12  # channels after the costs and their summaries
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +88,64 @@ def renamed(name: str) -> str:
         if name.startswith(before):
             return now + name[len(before) :]
     return name
+
+
+def with_paths(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Arrays by name, of which those of frames that were not followed along the flow are made today's: what is new is
+    not seen by the net, and believed as before anything is learned. Today's are as they are."""
+    found = dict(arrays)
+    kernel, head = ".analysis.net.mix.conv.kernel", (".analysis.net.head.kernel", ".analysis.net.head.bias")
+    for name in [name for name in found if name.endswith(kernel)]:
+        last = [name.removesuffix(kernel) + part for part in head]
+        planes = _planes_before(found[name], *(found.get(part) for part in last))
+        if planes is None:
+            continue
+        costs = np.array([*STILL, *(_NOW[0] + i for i in MOVING)])
+        blocks = (costs[:, None] * planes + np.arange(planes)).ravel()
+        found[name] = _placed(found[name], _inputs(blocks, planes), sum(_NOW) * (planes + 4) + _REST, axis=-2)
+        gains = 2 * planes + _with_surroundings()
+        rows = np.concatenate([np.arange(2 * planes), gains, 2 * planes + 2 * sum(_NOW) + np.arange(_outputs(0))])
+        for part in last:
+            found[part] = _placed(found[part], rows, 2 * planes + _outputs(2 * sum(_NOW)), axis=-1)
+    return found
+
+
+def _planes_before(kernel, *heads):
+    """Planes of a net of frames that were not followed along the flow, or None of any other."""
+    if any(array is None or not array.ndim for array in heads) or kernel.ndim < 2:
+        return None
+    planes = (size := heads[0].shape[-1]) - _outputs(2 * len(STILL + MOVING))
+    wanted = len(STILL + MOVING) * (planes // 2 + 4) + _REST
+    odd = planes < 2 or planes % 2 or kernel.shape[-2] != wanted or any(array.shape[-1] != size for array in heads)
+    return None if odd else planes // 2
+
+
+def _outputs(gains):
+    """Of the net's head beside those of two distributions over planes."""
+    return gains + 2 + analysis.MOVING_PARTS
+
+
+def _with_surroundings():
+    """Today's places of the earlier costs and of their means over the surroundings, the still ones first."""
+    still, moving = _NOW
+    twice = lambda first, count, places: [first + i + k * count for k in range(2) for i in places]
+    return np.array([*twice(0, still, STILL), *twice(2 * still, moving, MOVING)])
+
+
+def _inputs(blocks, planes):
+    """Today's places of the channels that the net saw."""
+    first, places = sum(_NOW) * planes, _with_surroundings()
+    rest = first + 4 * sum(_NOW) + np.arange(_REST)
+    return np.concatenate([blocks, first + places, first + 2 * sum(_NOW) + places, rest])
+
+
+def _placed(array, places, size, *, axis):
+    """Zeros with the array's entries at their places along an axis."""
+    shape = list(array.shape)
+    shape[axis] = size
+    grown = np.zeros(shape, array.dtype)
+    np.moveaxis(grown, axis, 0)[places] = np.moveaxis(array, axis, 0)
+    return grown
 
 
 def recipe_from_config(fields: Any) -> Recipe:

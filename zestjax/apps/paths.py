@@ -3,49 +3,67 @@
     T        frames of the path
     s        place on the path in [0, 1)
     base     the video's own camera at a time, smoothed: a rig that jumps from camera to camera gives its middle
+    share    of the video in [0, 1]: a time
 
 Offsets are in the base camera's axes, in units of the path's radius; the camera keeps looking at the middle depth.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from zestjax.cameras import Camera, check_camera, look_at, rigid_inverse
-from zestjax.io.layouts import as_float32, select
-from zestjax.io.reading import json_numbers, read_arrays, read_json
+from zestjax.apps.path_files import CameraPath, path_from_file
+from zestjax.cameras import Camera, look_at, rigid_inverse
+from zestjax.io.layouts import select
 
 CIRCLE = lambda s: np.stack([np.sin(2 * np.pi * s), np.cos(2 * np.pi * s), 0 * s], -1)
+NOWHERE = lambda s: np.zeros((len(s), 3))
+RUNS, STANDS = (lambda s: s), (lambda s: np.full(len(s), 0.5))
+CLOSER = 0.25  # of the way to the middle depth that a dolly zoom goes: the background grows visibly, nothing is passed
+
+
+class Kind(NamedTuple):
+    """What a path does at a place s, (T,). offset: (T, 3). time: (T,) share that is shown. base: (T,) share whose
+    camera it starts from, None: the one shown. nearer: (T,) share of the way to the middle depth that it goes, while
+    what is there keeps its size. rounds: of the video's frames that it has by default."""
+
+    offset: Callable
+    time: Callable = RUNS
+    base: Callable | None = None
+    nearer: Callable | None = None
+    rounds: int = 2
+
+
 PATHS = {
-    "orbit": lambda s: CIRCLE(2 * s),
-    "spiral": lambda s: CIRCLE(3 * s) * (1 - 0.6 * s)[:, None] + np.stack([0 * s, 0 * s, 2 * s], -1),
-    "wander": lambda s: np.stack(
-        [1.4 * np.sin(2 * np.pi * s), 0.5 * np.sin(4 * np.pi * s), 0.7 * np.cos(2 * np.pi * s)], -1
+    "orbit": Kind(lambda s: CIRCLE(2 * s)),
+    "spiral": Kind(lambda s: CIRCLE(3 * s) * (1 - 0.6 * s)[:, None] + np.stack([0 * s, 0 * s, 2 * s], -1)),
+    "wander": Kind(
+        lambda s: np.stack([1.4 * np.sin(2 * np.pi * s), 0.5 * np.sin(4 * np.pi * s), 0.7 * np.cos(2 * np.pi * s)], -1)
     ),
-    "freeze": lambda s: CIRCLE(s),
+    "freeze": Kind(CIRCLE, STANDS),
+    "fixed": Kind(NOWHERE, base=STANDS, rounds=1),
+    "stabilised": Kind(NOWHERE, rounds=1),
+    "space-time": Kind(
+        lambda s: CIRCLE(np.clip(3 * s - 1, 0, 1)) - CIRCLE(0 * s),
+        lambda s: np.where(s < 1 / 3, 1.5 * s, np.where(s < 2 / 3, 0.5, 1.5 * s - 0.5)),
+        rounds=3,
+    ),  # fmt: skip
+    "dolly": Kind(NOWHERE, base=STANDS, nearer=lambda s: CLOSER * np.sin(np.pi * s) ** 2),
     "frames": None,
 }
-"""By name: place to offset. Time runs along the path, but stands still in `freeze`; `frames`: the input cameras."""
-
-
-SHAPES = {"intrinsics": (3, 3), "camera_from_world": (4, 4)}
-
-
-class CameraPath(NamedTuple):
-    """cameras: `Camera` (T, ...) of numpy arrays. times: (T,) int frame times."""
-
-    cameras: Camera
-    times: np.ndarray
+"""By name. Time stands still in `freeze`, and for a third of `space-time`; the camera does in `fixed`; `stabilised` is
+the video's own without its jumps; `dolly` comes nearer and zooms out; `frames`: the input cameras."""
 
 
 def camera_path(name, video, *, count=None):
-    """A path by name, or from a file with `intrinsics` (T, 3, 3), `camera_from_world` (T, 4, 4) and `times` (T,).
+    """A path by name or from a file, see `path_files.path_from_file`.
 
     Args:
       name: one of `PATHS`, or an .npz or .json file; its cameras are of the video's size.
       video: `Video`.
-      count: T of a named path; None: twice the video's frames, and the video's own of `frames`.
+      count: T of a named path; None: twice the video's frames or as `PATHS` says, and the video's own of `frames`.
 
     Returns:
       `CameraPath`.
@@ -55,15 +73,20 @@ def camera_path(name, video, *, count=None):
     """
     frames = len(video.images)
     if name not in PATHS:
-        return _path_from_file(Path(name), frames)
-    if name == "frames":
+        if not Path(name).suffix:
+            raise ValueError(f"{name}: is no path; give one of {', '.join(PATHS)}, or an .npz or .json file.")
+        return path_from_file(Path(name), video)
+    kind = PATHS[name]
+    if kind is None:
         index = np.round(np.linspace(0, frames - 1, count or frames)).astype(int)
         return CameraPath(select(video.cameras, index), index)
-    count = 2 * frames if count is None else count
+    count = kind.rounds * frames if count is None else count
     s = np.arange(count) / count
-    times = np.full(count, frames // 2) if name == "freeze" else np.floor(s * frames).astype(int)
-    continuous = np.full(count, frames / 2) if name == "freeze" else s * (frames - 1)
-    return CameraPath(_moved(_smoothed(video, continuous), PATHS[name](s), video), times)
+    shares = kind.time(s)
+    base = _smoothed(video, (shares if kind.base is None else kind.base(s)) * (frames - 1))
+    nearer = np.zeros(count) if kind.nearer is None else kind.nearer(s)
+    times = np.minimum(shares * frames + 1e-9, frames - 1).astype(int)  # a third of a video is not always below itself
+    return CameraPath(_moved(base, kind.offset(s), nearer, video), times)
 
 
 def _smoothed(video, times):
@@ -82,12 +105,16 @@ def _smoothed(video, times):
     return mean, intrinsics
 
 
-def _moved(base, offsets, video):
-    """The base cameras (poses, intrinsics) moved by (T, 3) offsets, still looking at the middle depth."""
+def _moved(base, offsets, nearer, video):
+    """The base cameras (poses, intrinsics) moved by (T, 3) offsets and (T,) shares of the way, still looking at the
+    middle depth, which keeps its size."""
     poses, intrinsics = base
     rotation, position = poses[:, :3, :3], poses[:, :3, 3]
     inwards = np.array([0, 0, _middle(video)])
-    moved = position + np.einsum("tij,tj->ti", rotation, offsets * _radius(video))
+    inside = offsets * _radius(video) + nearer[:, None] * inwards
+    moved = position + np.einsum("tij,tj->ti", rotation, inside)
+    intrinsics = intrinsics.copy()
+    intrinsics[:, [0, 1], [0, 1]] *= 1 - nearer[:, None]
     pose = look_at(*(x.astype(np.float32) for x in (moved, position + rotation @ inwards)), up=-rotation[:, :, 1])
     return Camera(intrinsics.astype(np.float32), np.asarray(pose))
 
@@ -102,27 +129,3 @@ def _radius(video):
     middle = _middle(video)
     spread = np.sqrt(((centres - centres.mean(0)) ** 2).sum(-1).mean())
     return float(np.clip(0.5 * spread, 0.005 * middle, 0.06 * middle))
-
-
-def _path_from_file(path, frames):
-    if path.suffix not in (".npz", ".json") or not path.is_file():
-        raise ValueError(f"{path}: is no path; give one of {', '.join(PATHS)}, or an .npz or .json file.")
-    names = (*Camera._fields, "times")
-    stored = read_json(path) if path.suffix == ".json" else read_arrays(path, names=names)
-    if missing := [name for name in names if name not in stored]:
-        raise ValueError(
-            f"{path}: should hold `intrinsics`, `camera_from_world` and `times`, has no {missing}; write it again."
-        )
-    leaves = (json_numbers(path, stored, name, shape=(None, *shape)) for name, shape in SHAPES.items())
-    camera = Camera(*(as_float32(path, leaf) for leaf in leaves))
-    times = json_numbers(path, stored, "times", shape=(None,))
-    if (times != np.round(times)).any():
-        raise ValueError(f"{path}: `times` should be whole numbers, got {times[times != np.round(times)][0]:g}.")
-    count = len(times)
-    if camera.intrinsics.shape != (count, 3, 3) or camera.camera_from_world.shape != (count, 4, 4):
-        shapes = [leaf.shape for leaf in camera]
-        raise ValueError(f"{path}: expected ({count}, 3, 3) and ({count}, 4, 4) for {count} times, got {shapes}.")
-    if count == 0 or times.min() < 0 or times.max() >= frames:
-        raise ValueError(f"{path}: `times` should lie in 0 to {frames - 1}, the frames of the video.")
-    check_camera(str(path), camera)
-    return CameraPath(camera, times.astype(int))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from zestjax.apps.earlier import recipe_from_config, renamed
+from zestjax.apps.earlier import recipe_from_config, renamed, with_paths
 from zestjax.base.checks import check_option
 from zestjax.base.parts import from_stored, to_stored
 from zestjax.io.mvsnerf import read_mvsnerf
@@ -129,7 +129,7 @@ def open_weights(path=None, *, system=None, parts=()):
         raise WeightsError(f"{path}: {error}; use its version.") from error
     if system is not None and system != name:
         raise WeightsError(f"{path}: holds weights of `{name}`, not `{system}`; train them with --system {system}.")
-    params: Any = load_weights(path, like=like, renamed=None if "recipe" in metadata else names_of(name))[0]
+    params: Any = load_weights(path, like=like, renewed=renewing(metadata))[0]
     model, opponent = params if isinstance(params, Opponents) else (params, None)
     return Model(model, recipe, name, path, metadata, opponent)
 
@@ -155,13 +155,15 @@ def load_params(path, *, like):
     """
     if isinstance(like, Opponents) and not any(".discriminator" in name for name in load_weights(path)[0]):
         return like._replace(model=load_params(path, like=like.model))
-    earlier = "recipe" not in (metadata := read_metadata(path))
-    return load_weights(path, like=like, renamed=names_of(metadata.get("system")) if earlier else None)[0]
+    return load_weights(path, like=like, renewed=renewing(read_metadata(path)))[0]
 
 
-def names_of(system):
-    """Function from the name of an array of 0.1 to today's."""
-    return (lambda name: f".static{name}") if system == PUBLISHED else renamed
+def renewing(metadata):
+    """Function from the arrays of a file to today's, by its metadata; see `earlier`."""
+    if "recipe" in metadata:
+        return with_paths
+    name_now = (lambda name: f".static{name}") if metadata.get("system") == PUBLISHED else renamed
+    return lambda arrays: with_paths({name_now(name): array for name, array in arrays.items()})
 
 
 def standing_still(model):

@@ -23,12 +23,13 @@ from zestjax.frames.evidence import FLOW_CHANNELS, Evidence
 from zestjax.nets.layers import raised
 from zestjax.nets.unet2d import UNet2d, init_unet2d, unet2d
 
-STILL_COSTS, MOVING_COSTS = 6, 2  # static, best and still; moving; and each averaged over its surroundings
+# static, best, still, still along; moving, moving along; and each averaged over its surroundings
+STILL_COSTS, MOVING_COSTS = 8, 4
 COSTS = STILL_COSTS + MOVING_COSTS  # all, the static ones first
 SURROUNDINGS = 5  # cells, 20 pixels: the side of the square that costs are averaged over; a guess that was never varied
 GAIN = 3.0  # nats between the least and the greatest of a cost, before anything is learned
 SUMMARIES = 2 * COSTS + 4  # the least of each cost and its plane; ground and what stands, for both of `STANDING`
-STATIC_AROUND = 3  # of the costs, the static one averaged over its surroundings
+STATIC_AROUND = STILL_COSTS // 2  # of the costs, the static one averaged over its surroundings
 # Static cost above which a cell is taken to move, where what it stands on is looked for. Two, as one suits textured
 # scenes and the other flat ones: a guess that was never varied.
 STANDING = (0.25, 0.5)
@@ -60,7 +61,7 @@ class FrameMaps(NamedTuple):
 
 def init_analysis(key: jax.Array, *, planes: int, widths: Sequence[int]) -> AnalysisParams:
     """Parameters for E planes; `widths` are the U-Net's."""
-    n_in = 4 * planes + SUMMARIES + FLOW_CHANNELS + 2 + 12  # as `_channels` joins them
+    n_in = COSTS // 2 * planes + SUMMARIES + FLOW_CHANNELS + 2 + 12  # as `_channels` joins them
     net = init_unet2d(key, n_in, widths, 2 * planes + COSTS + 2 + MOVING_PARTS)
     # A small head: at first the costs decide.
     return AnalysisParams(net._replace(head=jax.tree.map(lambda x: 0.1 * x, net.head)))
@@ -88,7 +89,8 @@ class OwnMaps:
 
 def _costs(evidence):
     """(COSTS, V, h, w, E) all costs of a plane, each in [0, 1]: of standing still, then of moving evenly."""
-    still, moving = [evidence.static, evidence.best, evidence.still], [evidence.moving]
+    still = [evidence.static, evidence.best, evidence.still, evidence.still_along]
+    moving = [evidence.moving, evidence.moving_along]
     around = lambda costs: [_surrounding_mean(cost) for cost in costs]
     return jnp.stack([*still, *around(still), *moving, *around(moving)])
 
@@ -132,7 +134,7 @@ def _channels(evidence, costs, ground, still):
     """(V, h, w, n) what the net sees: every part of the evidence about 0, and where each cost is least."""
     planes = jnp.linspace(-1, 1, costs.shape[-1], dtype=costs.dtype)
     summaries = jnp.concatenate([2 * costs.min(-1) - 1, planes[costs.argmin(-1)], 2 * ground - 1, 2 * still - 1])
-    alone = (*costs[:STATIC_AROUND], costs[STILL_COSTS])
+    alone = (*costs[:STATIC_AROUND], *costs[STILL_COSTS : STILL_COSTS + MOVING_COSTS // 2])
     parts = [*(2 * cost - 1 for cost in alone), jnp.moveaxis(summaries, 0, -1)]
     return jnp.concatenate([*parts, 8 * evidence.flow - 4, 2 * evidence.sure - 1, 2 * evidence.colours - 1], -1)
 

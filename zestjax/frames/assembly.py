@@ -15,6 +15,7 @@ import numpy as np
 from zestjax.base.checks import traced
 from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera
+from zestjax.frames.along import gaps_along
 from zestjax.frames.cells import half_images
 from zestjax.frames.evidence import Evidence, MatchingViews, Neighbours, frame_evidence
 from zestjax.frames.optical_flow import VideoFlow, video_flow
@@ -59,8 +60,8 @@ def colours_of(images: Array) -> Array:
 
 
 @functools.partial(jax.jit, static_argnames=("planes",))
-def _evidence(image, camera, sources, neighbours, near, far, *, planes):
-    found = frame_evidence(image, camera, sources, neighbours, near, far, planes=planes)
+def _evidence(image, camera, sources, neighbours, along, near, far, *, planes):
+    found = frame_evidence(image, camera, sources, neighbours, along, near, far, planes=planes)
     return Evidence(*(jnp.round(255 * jnp.clip(x, 0, 1)).astype(jnp.uint8) for x in found))
 
 
@@ -89,15 +90,26 @@ def video_evidence(
       `Evidence` of uint8 numpy arrays, leading axis `frames`.
     """
     half, (flow, sure) = seen
-    places = positions(cameras)
+    places, bounds = positions(cameras), (np.float32(near), np.float32(far))
+    along = gaps_along(cameras, _beside(seen, cameras, exclude), *bounds, planes=planes)
     found = []
     for i in range(len(half)) if frames is None else frames:
         chosen, around = _compared(places, i, exclude)
         sources = MatchingViews(half[chosen.frames], taken(cameras, chosen.frames), chosen.valid)
         beside = Neighbours(flow[i], sure[i] * around.valid[:, None, None], taken(cameras, around.frames))
-        bounds = np.float32(near), np.float32(far)
-        found.append(_evidence(half[i], taken(cameras, i), sources, beside, *bounds, planes=planes))
+        path = jax.tree.map(lambda x, i=i: x[i], along)
+        found.append(_evidence(half[i], taken(cameras, i), sources, beside, path, *bounds, planes=planes))
     return jax.tree.map(lambda *rows: np.stack([np.asarray(r) for r in rows]), *found)
+
+
+def _beside(seen, cameras, exclude):
+    """`Neighbours` of every frame (N, 2, ...); those of a frame to exclude are not trusted, nor is such a neighbour."""
+    count = len(seen.half)
+    wanted = np.arange(count)[:, None] + [1, -1]
+    there = np.clip(wanted, 0, count - 1)
+    out = np.isin(np.arange(count), list(exclude))
+    sure = seen.flow.sure * ((wanted == there) & ~out[there] & ~out[:, None])[..., None, None].astype(np.float32)
+    return Neighbours(seen.flow.flow, sure, taken(cameras, there))
 
 
 def _compared(places, frame, exclude):

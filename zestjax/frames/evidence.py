@@ -28,6 +28,14 @@ FLOW_RANGE = 64.0  # pixels of flow, beyond what the far plane has, that the flo
 FLOW_CHANNELS = 16  # at the four half-resolution pixels of a cell, to both neighbours
 
 
+class Along(NamedTuple):
+    """Of one frame, or of many on a leading axis. still, moving: (h, w, E) gaps averaged over the path of the cell's
+    point through the video, see `frames.along`; 1 where no flow is to be trusted."""
+
+    still: Array
+    moving: Array
+
+
 class Evidence(NamedTuple):
     """Of one frame, or of many on a leading axis; every value in [0, 1].
 
@@ -35,6 +43,7 @@ class Evidence(NamedTuple):
     best: (h, w, E) mean over the better half of them: what covers the point in some does not count.
     still: (h, w, E) gap to the neighbours if the point stands still there.
     moving: (h, w, E) gap if it moves with constant velocity through t - 1, t, t + 1 at that plane.
+    still_along, moving_along: (h, w, E) of `Along`.
     flow: (h, w, 16) optical flow minus that of the far plane; 1/2 is none, see `FLOW_RANGE`.
     sure: (h, w, 2) trust in the flow to each neighbour.
     colours: (h, w, 12) the frame's colours at the four half-resolution pixels of the cell.
@@ -44,6 +53,8 @@ class Evidence(NamedTuple):
     best: Array
     still: Array
     moving: Array
+    still_along: Array
+    moving_along: Array
     flow: Array
     sure: Array
     colours: Array
@@ -111,6 +122,12 @@ def _ascending(arrays):
     return arrays
 
 
+def cell_flow(flow: Array, sure: Array) -> tuple[jax.Array, jax.Array]:
+    """Flow (2, 2h, 2w, 2) and its trust (2, 2h, 2w) of cells: (2, h, w, 2), the mean by trust, and (2, h, w)."""
+    weighted, sure = pooled(flow * sure[..., None], 2), pooled(sure[..., None], 2)
+    return weighted / jnp.where(sure > 0, sure, 1), sure[..., 0]
+
+
 def flow_gaps(flow: Array, sure: Array, hom: Array) -> tuple[jax.Array, jax.Array]:
     """(h, w) gaps at one plane if a cell stands still there, and if it moves with constant velocity.
 
@@ -150,6 +167,7 @@ def frame_evidence(
     camera: Camera,
     sources: MatchingViews,
     neighbours: Neighbours,
+    along: Along,
     near: Scalar,
     far: Scalar,
     *,
@@ -162,6 +180,7 @@ def frame_evidence(
       camera: its `Camera`, of the full-size image.
       sources: `MatchingViews` for the static cost.
       neighbours: `Neighbours`.
+      along: `Along` of it.
       near: () world units.
       far: () world units.
       planes: E.
@@ -175,14 +194,13 @@ def frame_evidence(
                  flow=(neighbours.flow, "2 P Q 2"), sure=(neighbours.sure, "2 P Q"))  # fmt: skip
     depths = plane_depths(near, far, planes, spacing="inverse")
     scaled = lambda share, of: homographies(resized(camera, share, share), resized(of, share, share), depths)
-    weighted = pooled(neighbours.flow * neighbours.sure[..., None], 2)
-    sure = pooled(neighbours.sure[..., None], 2)
-    flow = weighted / jnp.where(sure > 0, sure, 1)
+    flow, sure = cell_flow(neighbours.flow, neighbours.sure)
 
     def plane(hom):
-        return *static_costs(image, sources, hom[0]), *flow_gaps(flow, sure[..., 0], hom[1])
+        return *static_costs(image, sources, hom[0]), *flow_gaps(flow, sure, hom[1])
 
     found = jax.lax.map(plane, (scaled(0.5, sources.cameras), scaled(0.25, neighbours.cameras)))
     static, best, still, moving = (jnp.moveaxis(x, 0, -1) for x in found)
     beyond = _flow_channels(neighbours, scaled(0.5, neighbours.cameras)[-1])
-    return Evidence(static, best, still, moving, beyond, jnp.moveaxis(sure[..., 0], 0, -1), cell_values(image))
+    trusted = jnp.moveaxis(sure, 0, -1)
+    return Evidence(static, best, still, moving, along.still, along.moving, beyond, trusted, cell_values(image))

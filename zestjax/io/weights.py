@@ -82,7 +82,7 @@ def _plain(value, place="metadata", kinds=(dict,)):
 
 
 def load_weights(
-    path: FilePath, *, like: Tree = None, renamed: Callable[[str], str] | None = None
+    path: FilePath, *, like: Tree = None, renewed: Callable[[dict[str, Any]], dict[str, Any]] | None = None
 ) -> tuple[Any, dict[str, Any]]:
     """Read what `save_weights` wrote.
 
@@ -90,7 +90,7 @@ def load_weights(
       path: the file.
       like: tree of arrays or `jax.ShapeDtypeStruct`s of the wanted structure, shapes and types; None returns a flat
         dict from leaf path to numpy array instead.
-      renamed: function from the name of a stored leaf to its name in `like`, for files of an earlier version.
+      renewed: function from the stored arrays by name to those of `like`, for files of an earlier version.
 
     Returns:
       (params, metadata): the tree of jax arrays with the structure of `like`, and the dict given to `save_weights`.
@@ -100,8 +100,8 @@ def load_weights(
       WeightsError: no such file; or its leaves are not those of `like` (all differences are listed).
     """
     arrays, metadata = _read(Path(path))
-    if renamed is not None:
-        arrays = {renamed(name): array for name, array in arrays.items()}
+    if renewed is not None:
+        arrays = renewed(arrays)
     if like is None:
         return arrays, metadata
     wanted = _named_leaves(like)
