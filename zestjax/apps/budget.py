@@ -92,14 +92,23 @@ def candidates(frontier: Frontier, height: int, width: int) -> list[Point]:
         families.setdefault(point.setting.family, []).append(point)
     cheapest, largest = frontier.points[0].setting.family, frontier.curve[-1].setting.scale
     floor = max(LEAST_SCALE, LEAST_SIDE / min(height, width))
-    found = []
+    found, known = [], [point.setting.scale for point in frontier.curve]
     for family, points in families.items():
         measured = [point.setting.scale for point in points]
         low = floor if family == cheapest else max(floor, min(measured) / NEAR)
-        for scale in sizes(low, min(largest, max(measured) * NEAR)):
+        for scale in sorted({*sizes(low, min(largest, max(measured) * NEAR)), *measured}):
+            if blurred_alike(scale, known):
+                continue
             nearest = points[int(np.argmin(np.abs(np.log(measured) - np.log(scale))))]
             found.append(frontier.moved(nearest, scale))
     return found
+
+
+def blurred_alike(scale: float, known) -> bool:
+    """Whether a size lies between full size and the sizes beside it in the curve: any resampling blurs at once, so that
+    what is known of full size says nothing of a picture almost as large."""
+    below, above = [s for s in known if s < 1], [s for s in known if s > 1]
+    return max(below, default=1.0) < scale < 1 or 1 < scale < min(above, default=1.0)
 
 
 def sizes(low: float, high: float) -> list[float]:
