@@ -160,6 +160,7 @@ class Trials:
             for name in ("psnr", "ssim", "lpips"):
                 found[f"{name}_{region}"] = _moved(mean, trained, rest, region, name)
         low, high = interval(gains)
+        known = [trial["prepare_seconds"] for trial in own.values() if trial["prepare_seconds"] is not None]
         full = found["psnr_full"]
         return found | {
             "psnr_low": full + low - gains.mean(), "psnr_high": full + high - gains.mean(), "gain": float(gains.mean()),
@@ -168,7 +169,7 @@ class Trials:
             "seconds_high": float(np.quantile(seconds, 0.9)),
             "cpu_seconds": float(np.median([trial["cpu_seconds"] for trial in own.values()])),
             "clock_seconds": float(np.median([trial["seconds"] for trial in own.values()])),
-            "prepare_seconds": mean["prepare_seconds"], "peak_mb": mean["peak_mb"], "working_mb": mean["working_mb"],
+            "prepare_seconds": min(known, default=None), "peak_mb": mean["peak_mb"], "working_mb": mean["working_mb"],
             "joules_per_frame": mean["joules"],
         }  # fmt: skip
 
