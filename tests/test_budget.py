@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from zestjax.apps import budget, finetune, pilot, stored
+from zestjax.apps import budget, finetune, own, pilot, stored
 from zestjax.apps.budget import Budget, Clock
 from zestjax.apps.commands import megabytes
 from zestjax.apps.paths import camera_path
@@ -184,8 +184,8 @@ def test_what_is_no_frontier_is_refused_by_name(tmp_path, change):
 
 
 def test_the_shipped_frontier_tells_of_the_shipped_weights():
-    found, own = stored.frontier_of(stored.shipped_weights())
-    assert own and found.told["weights"] == stored.shipped_weights().name
+    found, theirs = stored.frontier_of(stored.shipped_weights())
+    assert theirs and found.told["weights"] == stored.shipped_weights().name
     assert {len(found.points), len(found.curve)}.isdisjoint({0, 1}) and 20 < found.psnr < 40
     assert any(point.setting == TRAINED and point.cost == 1 and point.gain == 0 for point in found.points)
 
@@ -209,6 +209,18 @@ def test_finetuning_gets_the_seconds_that_preparing_and_judging_leave(place):
     assert finetune.within_budget(replace(options, budget_seconds=None), place, VIDEO, ())[0].budget == 60.0
     with pytest.raises(ValueError, match="--budget-seconds 3 leaves no time"):
         finetune.within_budget(replace(options, budget_seconds=3.0), place, VIDEO, (3, 7))
+
+
+def test_a_scene_is_as_good_as_its_own_frames_that_nothing_read_tell():
+    asked = []
+
+    def view_of(camera, time, exclude):
+        asked.append((time, exclude))
+        return SimpleNamespace(colour=np.full((8, 12, 3), 0.5, np.float32)), 1.0
+
+    video: Any = SimpleNamespace(images=np.full((9, 8, 12, 3), 0.4, np.float32), cameras=np.zeros(9))
+    assert own.own_psnr(view_of, video, exclude=(3,)) == pytest.approx(20.0, abs=1e-3)
+    assert len(asked) == own.FRAMES and all(exclude == (3, time) != (3, 3) for time, exclude in asked)
 
 
 @pytest.mark.slow

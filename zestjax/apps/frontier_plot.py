@@ -19,10 +19,10 @@ def draw(path, rows, title):
         [row["psnr_high"] - row["psnr_full"] for row in best],
     ]
     axes.errorbar(*places(best), yerr=reach, fmt="o-", color="C0", ecolor="0.6", elinewidth=1, label="frontier")
-    for i, row in enumerate(best):  # to the right below and to the left above in turns: neighbours' names do not meet
-        place, side = (row["seconds_per_frame"], row["psnr_full"]), dict(ha="left", va="top") if i % 2 else {}
-        told = dict(xytext=(5, -4), **side) if side else dict(xytext=(-5, 4), ha="right", va="bottom")
-        axes.annotate(row["setting"], place, textcoords="offset points", fontsize=7, **told)
+    for i, row in enumerate(best):  # to the left above and to the right below in turns: neighbours' names do not meet
+        place, left = (row["seconds_per_frame"], row["psnr_full"]), i % 2 == 0
+        offset, ha, va = ((-5, 4), "right", "bottom") if left else ((5, -4), "left", "top")
+        axes.annotate(row["setting"], place, offset, textcoords="offset points", fontsize=7, ha=ha, va=va)
     axes.set(xlabel="seconds per frame", ylabel="PSNR, full image (dB)", title=title, xscale="log")
     axes.legend(loc="lower right")
     write_bytes(path, png_of(figure))

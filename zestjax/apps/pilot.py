@@ -19,7 +19,7 @@ from zestjax.apps.scaled import Renderers
 from zestjax.apps.settings import TRAINED
 from zestjax.apps.stored import Point, frontier_of
 
-TRIES = 4  # settings timed before the first frame: each may compile for a quarter of a minute
+TRIES = 3  # settings timed before the first frame: each may compile for a quarter of a minute
 SWITCHES = 2  # of the setting once frames are shown: a film should not flicker
 OFF = 0.1  # of a limit: within it, seconds are as asked
 TIMED_SECONDS = 0.5  # frames are timed for so long, three at most: short ones vary more
@@ -103,7 +103,7 @@ class Pilot:
         """Decibels as trained: of the frontier's scenes, or of this one, by frames predicted without themselves."""
         if self.budget.at_least_db is None or self.frontier.told.get("own_psnr") is None:
             return self.frontier.psnr
-        own = own_psnr(self._make(TRAINED), video)
+        own = own_psnr(self._make(TRAINED), video, exclude=self.first[2])
         return self.frontier.psnr + own - self.frontier.told["own_psnr"]
 
     def _chosen(self, left=None) -> Choice:
