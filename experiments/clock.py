@@ -19,6 +19,7 @@ from zestjax.apps.commands import numbers, size
 from zestjax.apps.evaluate import EvaluateOptions, evaluate
 from zestjax.apps.finetune import FinetuneOptions, finetune
 from zestjax.apps.results import write_record
+from zestjax.apps.simulate import SimulateOptions, simulate
 from zestjax.apps.train import TrainOptions, train
 from zestjax.io.figures import png_of
 from zestjax.io.files import write_bytes
@@ -30,7 +31,7 @@ FOREVER = 100_000  # steps of a schedule: the seconds end every run
 def scored(weights, out, options):
     """Scores of weights on the scene's held-out targets, `mean` of metrics.json."""
     evaluate(EvaluateOptions(
-        scene=f"bench:{options.scene}", out=out, weights=weights, size=options.size, targets=options.targets,
+        scene=str(options.out / "scene"), out=out, weights=weights, size=options.size, targets=options.targets,
         pictures=False, quiet=options.quiet,
     ))  # fmt: skip
     return json.loads((out / "metrics.json").read_text())["mean"]
@@ -40,7 +41,7 @@ def adapted(out, seconds, options):
     """The summary of fine-tuning for so many seconds in all."""
     begun = (out / "checkpoints").exists()
     return finetune(FinetuneOptions(
-        scene=f"bench:{options.scene}", out=out, budget=seconds, size=options.size, resume=begun,
+        scene=str(options.out / "scene"), out=out, budget=seconds, size=options.size, resume=begun,
         seed=options.seed, quiet=options.quiet,
     ))  # fmt: skip
 
@@ -50,7 +51,7 @@ def learned(system, out, seconds, options):
     height, width = options.size
     return train(TrainOptions(
         out, system=system, steps=FOREVER, minutes=seconds / 60, resume=True, seed=options.seed,
-        scenes=(f"bench:{options.scene}",), settings=(("height", str(height)), ("width", str(width))),
+        scenes=(str(options.out / "scene"),), settings=(("height", str(height)), ("width", str(width))),
         quiet=options.quiet,
     ))  # fmt: skip
 
@@ -62,6 +63,10 @@ def curves(options):
         "from scratch": lambda seconds: learned("zest", options.out / "scratch", seconds, options),
         "nsff": lambda seconds: learned("nsff", options.out / "nsff", seconds, options),
     }
+    if not (options.out / "scene").exists():
+        simulate(
+            SimulateOptions(scene=options.scene, out=options.out / "scene", size=options.size, quiet=options.quiet)
+        )
     start = {"seconds": 0.0, "compile_seconds": 0.0, **scored(None, options.out / "zero-shot", options)}
     found = {"zero-shot": [start]}
     for name, run in runs.items():

@@ -97,7 +97,7 @@ def test_a_frame_takes_what_it_may_or_as_much_as_is_of_use(place, machine, secon
 @pytest.mark.parametrize("seconds", [2.0, 6.0, 20.0])
 def test_all_frames_and_preparing_take_what_they_may(place, machine, seconds):
     flown, spent = piloted(place, machine, Budget(seconds=seconds), frames=20)
-    whole = flown.prepare_seconds + sum(spent)
+    whole = (flown.prepare_seconds or 0.0) + sum(spent)
     assert whole <= 1.1 * seconds
     assert whole >= 0.85 * seconds or flown.choice.point.gain >= -0.6
 

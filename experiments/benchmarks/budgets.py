@@ -1,10 +1,11 @@
 """Budgets, told and taken: frames of one scene by the shipped weights within so many seconds each.
 
     python experiments/benchmarks/budgets.py [--scene walker] [--budgets 0.1 0.3 1 3 10] [--frames 8]
+        [--processor]
 
 A JSON line for each budget: the setting in force at the end, the median seconds of the frames after the second (which
-corrects the setting), their share of the budget, and on a CPU the same by the processor's own seconds, which what else
-a single core does is no part of.
+corrects the setting) and their share of the budget. With `--processor` seconds are the processor's own, for which the
+budget is kept, too: on one core, what else it does is no part of them.
 """
 
 import argparse
@@ -12,9 +13,9 @@ import json
 import os
 import time
 
-import jax
 import numpy as np
 
+from zestjax.apps import evaluate
 from zestjax.apps.budget import Budget
 from zestjax.apps.cache import keep_compiled
 from zestjax.apps.paths import camera_path
@@ -24,20 +25,20 @@ from zestjax.apps.weights import open_weights
 from zestjax.simulate.bench import BENCH
 
 
+def timed_by_processor(function):
+    """As `evaluate.timed`: (result, seconds)."""
+    start = time.process_time()
+    result = function()
+    return result, time.process_time() - start
+
+
 def line(model, scene, seconds, frames):
     """What a budget was told and what it took."""
-    path, spent, processor = camera_path("orbit", scene.video, count=frames), [], []
+    path = camera_path("orbit", scene.video, count=frames)
     views, timing = render_path(model, scene, path, budget=Budget(frame_seconds=seconds), quiet=True)
-    start = time.process_time()
-    for _, each in views:
-        now = time.process_time()
-        spent.append(each)
-        processor.append(now - start)
-        start = time.process_time()
+    spent = [each for _, each in views]
     told, median = timing(spent[2:])["budget"], float(np.median(spent[2:]))
     found = {"what": f"budget {seconds:g} s", "setting": told["setting"], "seconds": median, "share": median / seconds}
-    if jax.default_backend() == "cpu":
-        found["processor_share"] = float(np.median(processor[2:])) / seconds
     return found | {"fits": told["fits"], "calibration_s": told["calibration_seconds"], "said": told["said"]}
 
 
@@ -47,7 +48,10 @@ def main():
     parser.add_argument("--scene", default="walker", choices=BENCH)
     parser.add_argument("--budgets", nargs="+", type=float, default=[0.1, 0.3, 1.0, 3.0, 10.0], metavar="SECONDS")
     parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--processor", action="store_true", help="seconds are the processor's own")
     options = parser.parse_args()
+    if options.processor:
+        evaluate.timed = timed_by_processor
     keep_compiled()
     model = open_weights()
     scene = open_scene(f"bench:{options.scene}", model.recipe, protocol=None).scene
