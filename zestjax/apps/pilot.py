@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zestjax.apps.budget import AIM, Budget, Choice, Clock, candidates, choose, limit_of, told
+from zestjax.apps.budget import AIM, SAME, Budget, Choice, Clock, candidates, choose, limit_of, told
 from zestjax.apps.memory import held_megabytes, peak_megabytes, reset_peak
 from zestjax.apps.own import own_psnr
 from zestjax.apps.scaled import Renderers
@@ -130,10 +130,12 @@ class Pilot:
                 break
         choice = self._chosen()
         if choice.point.setting not in tried:  # the tries are used up: the best that was seen to fit
+            more = choice.buys or choice.point
             choice = choose(
                 [point for _, point in tried.values()], self.budget, self.clock, self.frames, level=self.level,
                 held_mb=self.held, growth=self.growth, aim=1.0,
-            )._replace(buys=choice.buys)  # fmt: skip
+            )  # fmt: skip
+            choice = choice._replace(buys=more if more.gain > choice.point.gain + SAME else None)
         return tried[choice.point.setting][0], choice
 
     def _time(self, point: Point):
