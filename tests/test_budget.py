@@ -131,6 +131,11 @@ def test_no_more_is_spent_than_the_decibels_asked_for_need():
     assert 26.0 <= 28.0 + modest.point.gain <= 26.3
 
 
+def test_decibels_are_not_promised_of_sizes_that_nobody_saw():
+    assert choose(Budget(at_least_db=10.0)).point.setting.scale >= min(SCALES)
+    assert choose(Budget(frame_seconds=0.04)).point.setting.scale < min(SCALES)
+
+
 def test_decibels_out_of_reach_get_the_best_there_is_and_a_word():
     choice = choose(Budget(at_least_db=40.0))
     assert not choice.enough and choice.point.gain > 0.15

@@ -100,7 +100,8 @@ def candidates(frontier: Frontier, height: int, width: int) -> list[Point]:
             if blurred_alike(scale, known):
                 continue
             nearest = points[int(np.argmin(np.abs(np.log(measured) - np.log(scale))))]
-            found.append(frontier.moved(nearest, scale))
+            point = frontier.moved(nearest, scale)
+            found.append(point if scale >= min(known) else point._replace(gain_low=-np.inf))  # nobody saw one so small
     return found
 
 
@@ -169,7 +170,8 @@ def choose(
 
 def best_of(points: list[Point], clock: Clock, level: float, at_least_db: float | None) -> Point:
     """The fastest of those good enough; where none is, or nobody asks, the fastest of the best."""
-    good = [p for p in points if at_least_db is not None and level + p.gain >= at_least_db]
+    known = [p for p in points if np.isfinite(p.gain_low)]
+    good = [p for p in known if at_least_db is not None and level + p.gain >= at_least_db]
     if not good:
         most = max(p.gain for p in points)
         good = [p for p in points if p.gain >= most - SAME]
