@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from zestjax import novel_view
-from zestjax.apps import cache, frontier, tables
+from zestjax.apps import cache, frontier, settings, tables
 from zestjax.apps.cli import main
 from zestjax.apps.producer import ProducerError
 from zestjax.apps.train import TrainOptions, fresh
@@ -182,28 +182,48 @@ def test_render_writes_frames_a_film_and_its_timing(places, grey):
     timing = json.loads((out / "timing.json").read_text())
     assert len(list((out / "frames").iterdir())) == timing["frames"] == 5
     assert (out / timing["video"]).stat().st_size > 0 and timing["seconds_per_frame"] >= 0
-    assert timing["scale"] == 1.0
+    assert timing["scale"] >= 1.0 and timing["budget"]["fits"]
+
+
+def test_evaluate_keeps_to_a_budget_and_says_what_was_chosen(places, grey, capsys):
+    flags = ("--frame-ms", "300", "--at-least-db", "20", "--memory", "64GB", "--no-pictures")
+    assert run(places, "evaluate", *flags, "--out", str(places / "out/frugal")) == 0
+    said = capsys.readouterr()
+    report = json.loads((places / "out/frugal/metrics.json").read_text())
+    assert said.out.count("\n") == 1 and report["budget"]["said"] in said.out and "a second more a frame" in said.out
+    assert sum(line.startswith("budget: ") for line in said.err.splitlines()) >= 1
+    assert (report["height"], report["width"]) == (HEIGHT, WIDTH) and report["mean"]["full"]["psnr"] > 0
+    with pytest.raises(SystemExit) as refusal:
+        run(places, "evaluate", "--memory", "1.5")
+    assert refusal.value.code == 2 and "no size of memory" in capsys.readouterr().err
 
 
 def test_a_budget_that_is_too_small_falls_back_to_the_smallest_size(places, grey):
     out = places / "out/hurry"
     assert run(places, "render", "--frames", "3", "--budget-seconds", "1e-9", "--quiet", "--out", str(out)) == 0
     timing = json.loads((out / "timing.json").read_text())
-    assert timing["scale"] < 0.4 and (timing["height"], timing["width"]) == (HEIGHT, WIDTH)
+    assert (
+        timing["scale"] < 1 and not timing["budget"]["fits"] and (timing["height"], timing["width"]) == (HEIGHT, WIDTH)
+    )
 
 
 def test_frontier_writes_every_setting_and_marks_what_no_other_beats(places, grey, capsys):
     assert run(places, "frontier") == 0
     assert capsys.readouterr().out.startswith("frontier: on toy")
     lines = (places / "out/frontier/frontier.csv").read_text().splitlines()
-    assert lines[0] == "setting,psnr_full,psnr_dynamic,ssim_full,seconds_per_frame,peak_mb,pareto"
-    assert len(lines) == 1 + len(frontier.settings_of(TINY.system))
-    assert (places / "out/frontier/frontier.png").is_file()
+    assert lines[0].startswith("setting,psnr_full,psnr_dynamic,ssim_full,seconds_per_frame,peak_mb,pareto,")
+    assert len(lines) > 1 + len(settings.scales()) and any(line.startswith("as trained,") for line in lines)
+    assert all((places / "out/frontier" / name).is_file() for name in ("frontier.png", "frontier.json", "report.html"))
+    trials = (places / "out/frontier/trials.jsonl").read_bytes()
+    assert run(places, "frontier", "--resume", "--quiet") == 0
+    assert (places / "out/frontier/trials.jsonl").read_bytes().startswith(trials)
+    refused(capsys, run(places, "frontier", "--resume", "--targets", "1", "--quiet"), "trials.jsonl", "--resume")
 
 
 def test_the_pareto_set_holds_what_is_fastest_what_is_best_and_no_loser():
-    rows = [{"seconds_per_frame": s, "psnr_full": p} for s, p in ((1, 20), (2, 25), (3, 24), (2, 24), (0.5, 10))]
-    assert [row["pareto"] for row in frontier.mark_pareto(rows)] == [1, 1, 0, 0, 1]
+    points = ((1, 20, 2), (2, 25, 2), (3, 24, 2), (2, 24, 2), (0.5, 10, 2), (0.1, 99, 1))
+    rows: list[dict] = [{"seconds_per_frame": s, "psnr_full": p, "targets": n, "pareto": 0} for s, p, n in points]
+    assert [row["pareto"] for row in frontier.mark_pareto(rows, 2)] == [1, 1, 0, 0, 1, 0]
 
 
 def test_weights_tell_their_system(places):

@@ -110,6 +110,7 @@ def _finetune(commands):
         "--budget", type=positive_float, default=60.0, metavar="SECONDS", help="of stepping (default 60)"
     )
     command.add_argument("--exclude", type=numbers, default=(), metavar="i,j,...", help="frames that are never read")
+    _budget_flags(command, "for preparing, stepping and judging")
     command.add_argument("--resume", action="store_true", help="go on from the folder's newest checkpoint")
 
 
@@ -122,7 +123,7 @@ def _render(commands):
         help="orbit, spiral, wander, freeze, fixed, stabilised, space-time, dolly, frames, or a file",
     )
     command.add_argument("--frames", type=positive, help="of the path (default: twice the video's)")
-    command.add_argument("--budget-seconds", type=positive_float, metavar="S", help="for all frames: renders smaller")
+    _budget_flags(command)
     command.add_argument("--still", action="store_true", help="nothing moves: what would is not compiled")
     command.add_argument("--precision", help="float32, bfloat16 (networks only) or float64 (default: the weights' own)")
     command.add_argument("--fps", type=positive_float, default=12.0)
@@ -131,6 +132,7 @@ def _render(commands):
 def _evaluate(commands):
     command = _command(commands, "evaluate", "scores against held-out truth, beside floors and ceiling", _run_evaluate)
     _scene_flags(command)
+    _budget_flags(command)
     command.add_argument(
         "--protocol", default="held-out", help="held-out, strict, paper or fixed-view (default held-out)"
     )
@@ -144,7 +146,13 @@ def _evaluate(commands):
 def _frontier(commands):
     command = _command(commands, "frontier", "accuracy against time: what each setting buys", _run_frontier)
     _scene_flags(command)
-    command.add_argument("--targets", type=numbers, metavar="i,j,...", help="times to predict (default: four)")
+    command.add_argument(
+        "--targets", type=numbers, metavar="i,j,...", help="times to predict (default: four; of each of bench:all one)"
+    )
+    command.add_argument("--tries", type=positive, default=16, metavar="N", help="settings to search (default 16)")
+    command.add_argument("--repeats", type=positive, default=1, metavar="N", help="renderings of each (default 1)")
+    command.add_argument("--lpips", type=Path, metavar="FILE", help="LPIPS's weights, from import-lpips (default: n/a)")
+    command.add_argument("--resume", action="store_true", help="go on from the folder's trials")
 
 
 def _crossval(commands):
@@ -198,6 +206,14 @@ def _scene_flags(command):
     command.add_argument("--weights", type=Path, metavar="W", help="default: the shipped ones")
     command.add_argument("--system", help="refuse weights of another system")
     command.add_argument("--size", type=size, metavar="HxW", help="default: the preset's height")
+
+
+def _budget_flags(command, seconds="for preparing and all frames"):
+    """What rendering may take: its setting is chosen by it."""
+    command.add_argument("--budget-seconds", type=positive_float, metavar="S", help=seconds)
+    command.add_argument("--frame-ms", type=positive_float, metavar="M", help="for each frame, milliseconds")
+    command.add_argument("--at-least-db", type=positive_float, metavar="D", help="expected of the pictures: no dearer")
+    command.add_argument("--memory", type=megabytes, metavar="SIZE", help="of rendering: 800MB, 1.5GB, 1GiB")
 
 
 def _run_demo(options):
@@ -308,6 +324,24 @@ def positive(text):
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1")
     return int(text)
+
+
+def megabytes(text):
+    """MB of a size with its unit."""
+    units = {
+        "B": 1e-6,
+        "KB": 1e-3,
+        "MB": 1.0,
+        "GB": 1e3,
+        "TB": 1e6,
+        "KIB": 1.024e-3,
+        "MIB": 1.048576,
+        "GIB": 1073.741824,
+    }
+    match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([a-zA-Z]+)", text)
+    if not match or match[2].upper() not in units or not 0 < float(match[1]) < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is no size of memory: give one with its unit, as 800MB or 1.5GB")
+    return float(match[1]) * units[match[2].upper()]
 
 
 def positive_float(text):

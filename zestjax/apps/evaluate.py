@@ -4,6 +4,7 @@ Every score carries its seconds: of one frame, the volumes of its target include
 what is done once for a video (`prepare`) and the compile stand beside them.
 """
 
+import copy
 import dataclasses
 import sys
 import time
@@ -45,6 +46,10 @@ class EvaluateOptions:
     lpips: Path | None = None
     still: bool = False
     precision: str | None = None
+    budget_seconds: float | None = None
+    frame_ms: float | None = None
+    at_least_db: float | None = None
+    memory: float | None = None
     seed: int = 0
     quiet: bool = False
 
@@ -67,10 +72,13 @@ def evaluate(options):
 def _evaluate(model, options):
     if options.scene != "bench:all":
         report = evaluate_scene(model, options, Path(options.out))
-        return f"evaluate: {headline(report)}: {Path(options.out) / 'metrics.json'}"
+        chosen = f"; {report['budget']['said']}" if report["budget"] else ""
+        return f"evaluate: {headline(report)}{chosen}: {Path(options.out) / 'metrics.json'}"
     from zestjax.simulate.bench import BENCH
 
     out, reports = Path(options.out), []
+    if options.budget_seconds is not None:  # for all frames of all scenes
+        options = dataclasses.replace(options, budget_seconds=options.budget_seconds / len(BENCH))
     for name in BENCH:
         reports.append(evaluate_scene(model, dataclasses.replace(options, scene=f"bench:{name}"), out / name))
         write_table(out, reports)
@@ -88,7 +96,20 @@ def evaluate_scene(model, options, out):
     opened = open_scene(options.scene, model.recipe, size=options.size, protocol=options.protocol,
                         targets=options.targets, layout=options.format)  # fmt: skip
     model = standing_still(model) if options.still else model
-    return score_scene(Renderer(model, opened.scene.video, steady=True), opened, options, out)
+    return score_scene(renderer_of(model, opened.scene, options), opened, options, out)
+
+
+def renderer_of(model, scene, options):
+    """A `Renderer` of a scene or, where the flags have a budget, a `pilot.Pilot`."""
+    from zestjax.apps.pilot import Budget, Pilot
+
+    budget = Budget.of(options)
+    if not budget:
+        return Renderer(model, scene.video, steady=True)
+    first = scene.targets[0]
+    return Pilot(
+        model, scene.video, budget, len(scene.targets), (first.camera, first.time, first.exclude), quiet=options.quiet
+    )
 
 
 def score_scene(view_of, opened, options, out):
@@ -110,7 +131,8 @@ def score_scene(view_of, opened, options, out):
         "preset": model.preset, "precision": model.system.precision,
         "device": device_name(), "weights": str(model.path),
         **summary(rows), "prepare_seconds": number(view_of.prepare_seconds),
-        "compile_seconds": number(view_of.compile_seconds), "targets": [row["row"] for row in rows],
+        "compile_seconds": number(view_of.compile_seconds), "budget": getattr(view_of, "record", None),
+        "targets": [row["row"] for row in rows],
     }  # fmt: skip
     results.write_record(out / "metrics.json", report)
     return report
@@ -144,6 +166,12 @@ class Renderer:
         self.prepared, self.first_seconds = timed(prepare)
         if steady:
             self.prepared, self.prepare_seconds = timed(prepare)
+
+    def running(self, system):
+        """Views of the same prepared video with another system of the same parameters."""
+        other = copy.copy(self)
+        other.system = system
+        return other
 
     def __call__(self, camera, frame_time, exclude=()):
         """(`View`, seconds)."""

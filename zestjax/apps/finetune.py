@@ -18,10 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax import novel_view
+from zestjax.apps.budget import Budget
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.own_frames import known_of, own_frame_batches
+from zestjax.apps.pilot import Pilot
 from zestjax.apps.results import write_record
 from zestjax.apps.scenes import digest, open_scene, place_of
+from zestjax.apps.settings import TRAINED
 from zestjax.apps.train import run_name, summarise
 from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.base.parts import to_stored
@@ -58,6 +61,10 @@ class FinetuneOptions:
     format: str | None = None
     resume: bool = False
     steps: int = FOREVER
+    budget_seconds: float | None = None
+    frame_ms: float | None = None
+    at_least_db: float | None = None
+    memory: float | None = None
     seed: int = 0
     quiet: bool = False
 
@@ -85,6 +92,7 @@ def finetune(options):
     moving = moving_pixels(prepared)
     judges = () if moving is None else judging_frames(video, moving, options.exclude)
     known = known_of(opened.scene)._replace(moving=moving)
+    options, chosen = within_budget(options, model, video, judges)
     recipe = dataclasses.replace(model.recipe, rate=RATE)
     recipe = recipe.of(model.system, known=answers_of(known)) if moving is None else recipe.weighted(STILL_WEIGHTS)
     (init, step_fn), objective = recipe.trainer(steps=FOREVER), recipe.objective()
@@ -103,11 +111,44 @@ def finetune(options):
     batch_at = step_batches(one_at, recipe.clips)
     step_fn = jax.jit(step_fn, donate_argnums=(0, 1))
     result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata, explain=explain)
-    summary = summarise(result, options.out, "finetune")
+    summary = _with_setting(summarise(result, options.out, "finetune"), chosen)
     if not result.finished or not judges:
         return summary
     verdict = judged(model, result.state.params, prepared, moving, judges, options.exclude)
     return _told(summary, verdict, model, metadata)
+
+
+def within_budget(options, model, video, judges):
+    """The options with the stepping that their budget leaves, and the `Pilot` of rendering what was trained, or None
+    where they say nothing of rendering.
+
+    Raises:
+      ValueError: preparing and judging alone take the budget.
+    """
+    budget, pilot = Budget.of(options), None
+    rendering = dataclasses.replace(budget, seconds=None)
+    if rendering:
+        at = judges[0] if judges else next(i for i in range(len(video.images)) if i not in options.exclude)
+        first = jax.tree.map(lambda leaf: leaf[at], video.cameras), at, options.exclude
+        pilot = Pilot(model, video, rendering, 1, first, quiet=options.quiet)
+    if budget.seconds is None:
+        return options, pilot
+    clock = Pilot.clock_of(model, video)
+    other = clock.prepare(TRAINED) + 2 * len(judges) * clock.frame(1.0)  # each judge is rendered by both weights
+    if (left := budget.seconds - other) <= 0:
+        raise ValueError(
+            f"finetune: --budget-seconds {budget.seconds:g} leaves no time to step: preparing and judging take about "
+            f"{other:.1f} s; give more."
+        )
+    return dataclasses.replace(options, budget=min(left, options.budget)), pilot
+
+
+def _with_setting(summary, pilot):
+    """The summary with the setting that the weights are to be rendered by, which is stored beside them."""
+    if pilot is None:
+        return summary
+    write_record(summary.weights.parent / "setting.json", pilot.record)
+    return summary._replace(line=f"{summary.line}; to render: {pilot.line}")
 
 
 def _told(summary, verdict, model, metadata):

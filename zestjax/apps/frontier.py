@@ -1,46 +1,48 @@
-"""`zestjax frontier`: what each setting costs and gives on one scene, with one set of weights.
+"""`zestjax frontier`: what each setting costs and gives, with one set of weights; a search over all axes together.
 
-The settings vary samples per ray, depth planes, source views and resolution: one at a time, then together. A setting is
-on the frontier when no other is both faster and better.
+Settings vary depth planes, source views, samples per ray, precision and resolution. They are drawn jointly, halved on
+ever more targets, and what is left is improved by steps (`search`). A setting is on the frontier when it was measured
+on all targets and no other such is both faster and better.
 """
 
 import csv
 import dataclasses
 import io
-from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from zestjax.apps.evaluate import Renderer
-from zestjax.apps.memory import peak_megabytes, reset_peak
-from zestjax.apps.progress import progress
-from zestjax.apps.render import scaled_video
-from zestjax.apps.scenes import open_scene
-from zestjax.apps.scoring import mean_scores, score_image
+from zestjax.apps.evaluate import device_name
+from zestjax.apps.frontier_page import Shown, write_page
+from zestjax.apps.frontier_plot import draw
+from zestjax.apps.progress import progress_of
+from zestjax.apps.scenes import digest, open_scene
+from zestjax.apps.search import front, search
+from zestjax.apps.settings import TRAINED, begun_with, scales
+from zestjax.apps.stored import NAME, Frontier, Point, write_frontier
+from zestjax.apps.trials import Trials
 from zestjax.apps.weights import arithmetic, open_weights
-from zestjax.cameras import resized
-from zestjax.io.figures import png_of
 from zestjax.io.files import write_bytes
-from zestjax.io.pictures import resize_area
-from zestjax.systems.sampling import Even
-from zestjax.systems.system import System
+from zestjax.io.lpips import load_lpips
+from zestjax.io.pictures import encoded_png
+from zestjax.simulate.bench import BENCH
 
 COLUMNS = ("setting", "psnr_full", "psnr_dynamic", "ssim_full", "seconds_per_frame", "peak_mb", "pareto")
+"""The first ones: scripts read them."""
+MORE = (
+    "psnr_static", "psnr_low", "psnr_high", "ssim_dynamic", "ssim_static", "lpips_full", "lpips_dynamic",
+    "lpips_static", "depth_abs_rel", "seconds_low", "seconds_high", "clock_seconds", "cpu_seconds",
+    "prepare_seconds", "working_mb", "joules_per_frame", "targets", "planes", "views", "samples", "precision", "scale",
+)  # fmt: skip
 
-
-class Setting(NamedTuple):
-    """name: str. system: `System` to render with. scale: of the resolution."""
-
-    name: str
-    system: System
-    scale: float = 1.0
+TURNS = 5  # in which what was found is timed: fewer, and a frame that was disturbed is in the middle
+RUN_ALONE = ("frames", "lpips")  # what tells one run's trials from another's, and no reader of its frontier needs
 
 
 @dataclasses.dataclass(frozen=True)
 class FrontierOptions:
-    """The flags of `zestjax frontier`; see the command's help. targets: times, four of zest-bench unless told."""
+    """The flags of `zestjax frontier`; see the command's help. targets: times, four of zest-bench unless told, one of
+    each scene of `bench:all`. tries: settings beside those of the size alone."""
 
     scene: str
     out: Path
@@ -49,29 +51,12 @@ class FrontierOptions:
     size: tuple | None = None
     targets: tuple | None = None
     format: str | None = None
+    tries: int = 16
+    repeats: int = 1
+    lpips: Path | None = None
+    resume: bool = False
     seed: int = 0
     quiet: bool = False
-
-
-def settings_of(system):
-    """The settings tried with weights of a system; the first is its own."""
-    frames, planes, sampler = system.static.frames, system.space.planes, system.sampler
-    swept = lambda n: replace(system, space=replace(system.space, planes=n))
-    looking = lambda n: replace(system, static=replace(system.static, frames=replace(frames, count=n)))
-    evenly = lambda n: replace(system, sampler=Even(n, "plane"))
-    tried = [Setting("as trained", system)]
-    head = getattr(system.static, "head", None)
-    if head is not None and head.looks:  # a head that looks at each view takes any number of them
-        views = frames.count
-        tried += [Setting(f"{n} views", looking(n)) for n in (views * 3 // 2, views // 2, views // 4)]
-    tried += [Setting(f"{n} planes", swept(n)) for n in (planes * 3 // 2, planes // 2)]
-    if sampler.guided:
-        tried += [Setting(f"{n} regular samples", evenly(n)) for n in (planes // 2, planes, 2 * planes)]
-    else:
-        fewer = (max(1, sampler.samples // 2), max(1, sampler.samples // 4))
-        tried += [Setting(f"{n} samples", replace(system, sampler=replace(sampler, samples=n))) for n in fewer]
-    tried += [Setting(f"{scale} of the size", system, scale) for scale in (0.75, 0.5)]
-    return [*tried, Setting(f"{planes // 2} planes, 0.75 of the size", swept(planes // 2), 0.75)]
 
 
 @arithmetic()
@@ -85,80 +70,124 @@ def frontier(options):
       ValueError, WeightsError: a scene or weights that cannot be used.
     """
     model, out = open_weights(options.weights, system=options.system), Path(options.out)
-    opened = open_scene(options.scene, model.recipe, size=options.size, protocol="held-out", layout=options.format,
-                        targets=options.targets or default_times(options))  # fmt: skip
-    scene, rows = opened.scene, []
-    for setting in progress(settings_of(model.system), "frontier", quiet=options.quiet):
-        rows.append({"setting": setting.name, **measure(model, scene, setting)})
-        write_rows(out, mark_pareto(rows))
-    draw(out / "frontier.png", rows, scene.name)
-    best, own = max(rows, key=lambda row: row["psnr_full"]), rows[0]
-    good = [row for row in rows if row["psnr_full"] >= best["psnr_full"] - 0.1]
-    fast = min(good, key=lambda row: row["seconds_per_frame"])
-    return (
-        f"frontier: on {scene.name} `{fast['setting']}` reaches {fast['psnr_full']:.2f} dB in "
-        f"{fast['seconds_per_frame']:.2f} s a frame, within 0.1 dB of the best; as trained "
-        f"{own['psnr_full']:.2f} dB in {own['seconds_per_frame']:.2f} s: {out / 'frontier.csv'}"
+    scenes = open_scenes(options, model)
+    with progress_of("frontier", len(scales()) + options.tries, quiet=options.quiet) as tick:
+        lpips = None if options.lpips is None else load_lpips(options.lpips)
+        trials = Trials(model, scenes, out / "trials.jsonl", repeats=options.repeats, lpips=lpips, tick=tick)
+        trials.begin(header(model, scenes, options), resume=options.resume)
+        tried = [setting for setting, _ in trials.done]  # by a run before this one
+        first = [*scales(), *begun_with(options.tries - options.tries // 2, options.seed), *tried]
+        trials.measured(TRAINED, len(trials.targets))
+        found = search(
+            first, scales(), model.system,
+            rungs=rungs(len(trials.targets)), measured=trials.measured, tries=options.tries // 2,
+        )  # fmt: skip
+        trials.time_together(found, TURNS)
+    rows = rows_of(trials, model)
+    write_rows(out, rows)
+    about = header(model, scenes, options) | {"own_psnr": trials.own_psnr()}
+    write_frontier(out / NAME, stored(trials, rows, {k: v for k, v in about.items() if k not in RUN_ALONE}))
+    name = scenes[0].name if len(scenes) == 1 else f"{len(scenes)} scenes"
+    draw(out / "frontier.png", rows, name)
+    shown, truth = at_budgets(trials, rows)
+    told = summary(rows, name)
+    write_page(out, rows, title=name, told=told, shown=shown, truth=truth)
+    return f"frontier: {told}: {out / 'frontier.csv'}"
+
+
+def at_budgets(trials, rows):
+    """The first target by the cheapest, the middle and the best setting of the frontier, and its truth, as PNGs."""
+    best = sorted((row for row in rows if row["pareto"]), key=lambda row: row["seconds_per_frame"])
+    views, truth = [], None
+    for row in (best[0], best[len(best) // 2], best[-1]):
+        view, truth = trials.shown(row["value"], 0)
+        caption = f"{row['setting']}: {row['seconds_per_frame']:.2g} s, {row['psnr_full']:.2f} dB on all targets"
+        views.append(Shown(caption, encoded_png(np.clip(np.asarray(view.colour, np.float32), 0, 1))))
+    return views, encoded_png(truth)
+
+
+def open_scenes(options, model):
+    """The scene of the flags, or all of zest-bench."""
+    whole = options.scene == "bench:all"
+    times = options.targets
+    if times is None and str(options.scene).startswith("bench:"):
+        times = (9,) if whole else (3, 9, 14, 20)
+    names = [f"bench:{name}" for name in BENCH] if whole else [options.scene]
+    opened = (
+        open_scene(name, model.recipe, size=options.size, protocol="held-out", layout=options.format, targets=times)
+        for name in names
     )
+    return [each.scene for each in opened]
 
 
-def default_times(options):
-    """Four times spread over a scene of zest-bench; all there are of a folder."""
-    return (3, 9, 14, 20) if str(options.scene).startswith("bench:") else None
-
-
-def measure(model, scene, setting):
-    """A setting's row but for its name: mean scores, median seconds and the peak memory of the process meanwhile."""
-    reset_peak()
-    size = scene.video.images.shape[1:3]
-    video = scaled_video(scene.video, setting.scale)
-    factors = [new / old for new, old in zip(video.images.shape[1:3], size, strict=True)]
-    view_of = Renderer(model, video, steady=True, system=setting.system)
-    scores, seconds = [], []
-    for target in scene.targets:
-        view, spent = view_of(resized(target.camera, factors[1], factors[0]), target.time, target.exclude)
-        image = resize_area(np.clip(np.asarray(view.colour, np.float32), 0, 1), *size)
-        scores.append(score_image(image, target.image, target.dynamic))
-        seconds.append(spent)
-    mean = mean_scores(scores)
-    dynamic = mean["dynamic"]["psnr"] if mean["dynamic"] else None
+def header(model, scenes, options):
+    """What trials are of."""
+    height, width = scenes[0].video.images.shape[1:3]
     return {
-        "psnr_full": mean["full"]["psnr"], "psnr_dynamic": dynamic, "ssim_full": mean["full"]["ssim"],
-        "seconds_per_frame": float(np.median(seconds)), "peak_mb": peak_megabytes(),
+        "weights": model.path.name, "step": model.metadata.get("step"), "preset": model.preset, "device": device_name(),
+        "scenes": [scene.name for scene in scenes], "frames": [digest(scene.video) for scene in scenes],
+        "targets": [[t.time for t in scene.targets] for scene in scenes], "height": height, "width": width,
+        "video_frames": len(scenes[0].video.images),
+        "lpips": options.lpips is not None,
     }  # fmt: skip
 
 
-def mark_pareto(rows):
-    """The rows with `pareto` 1 where no other row is at least as fast and as good, and better in one; else 0."""
-    cost = lambda row: (row["seconds_per_frame"], -row["psnr_full"])
-    beats = lambda a, b: all(x <= y for x, y in zip(cost(a), cost(b), strict=True)) and cost(a) != cost(b)
-    for row in rows:
-        row["pareto"] = int(not any(beats(other, row) for other in rows))
+def rungs(count):
+    """Numbers of targets: a quarter, half and all."""
+    return sorted({max(1, count // 4), max(1, count // 2), count})
+
+
+def rows_of(trials, model):
+    """A row for each setting tried, those measured on all targets marked `pareto` where no other beats them."""
+    tried = dict.fromkeys(setting for setting, _ in trials.done)
+    rows = [
+        {"setting": s.named(model.system), **trials.row(s), **dataclasses.asdict(s), "value": s, "pareto": 0}
+        for s in tried
+    ]
+    return mark_pareto(sorted(rows, key=lambda row: row["seconds_per_frame"]), len(trials.targets))
+
+
+def mark_pareto(rows, targets):
+    """The rows with `pareto` 1 where no other of those measured on so many targets is at least as fast and as good, and
+    better in one; else 0."""
+    whole = [row for row in rows if row["targets"] >= targets]
+    points = [(row["seconds_per_frame"], row["psnr_full"]) for row in whole]
+    for i in front(points):
+        whole[i]["pareto"] = 1
     return rows
 
 
 def write_rows(out, rows):
     """Write `frontier.csv`."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    names = [*COLUMNS, *MORE]
+    writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writeheader()
     shown = lambda value: "" if value is None else round(value, 4) if isinstance(value, float) else value
-    writer.writerows({name: shown(row[name]) for name in COLUMNS} for row in rows)
+    writer.writerows({name: shown(row[name]) for name in names} for row in rows)
     write_bytes(out / "frontier.csv", text.getvalue().encode())
 
 
-def draw(path, rows, title):
-    """Write the plot: seconds against PSNR, the frontier joined and its settings named."""
-    from matplotlib.figure import Figure
+def stored(trials, rows, told):
+    """The `Frontier` of rows: of settings that were measured on all targets."""
+    own = next(row for row in rows if row["value"] == TRAINED)
+    cost = lambda row: row["seconds_per_frame"] / own["seconds_per_frame"]
+    points = [
+        Point(row["value"], cost(row), row["gain"], row["gain_low"], row["gain_high"], row["working_mb"])
+        for row in rows if row["targets"] >= len(trials.targets)
+    ]  # fmt: skip
+    points = tuple(sorted(points, key=lambda point: point.cost))
+    return Frontier(points, own["psnr_full"], own["seconds_per_frame"], own["prepare_seconds"], told)
 
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.subplots()
-    best = sorted((row for row in rows if row["pareto"]), key=lambda row: row["seconds_per_frame"])
-    axes.plot(*np.array([(r["seconds_per_frame"], r["psnr_full"]) for r in best]).T, "o-", color="C0", label="frontier")
-    for row in rows:
-        place = (row["seconds_per_frame"], row["psnr_full"])
-        axes.plot(*place, "o", color="C0" if row["pareto"] else "0.7", zorder=0)
-        axes.annotate(row["setting"], place, xytext=(4, -9), textcoords="offset points", fontsize=7)
-    axes.set(xlabel="seconds per frame", ylabel="PSNR, full image (dB)", title=title, xscale="log")
-    axes.legend()
-    write_bytes(path, png_of(figure))
+
+def summary(rows, name):
+    """The line of a command: the fastest setting within 0.1 dB of the best, beside the weights as trained."""
+    whole = [row for row in rows if row["pareto"]]
+    best, own = max(whole, key=lambda row: row["psnr_full"]), next(row for row in rows if row["value"] == TRAINED)
+    good = [row for row in whole if row["psnr_full"] >= best["psnr_full"] - 0.1]
+    fast = min(good, key=lambda row: row["seconds_per_frame"])
+    return (
+        f"on {name} `{fast['setting']}` reaches {fast['psnr_full']:.2f} dB in {fast['seconds_per_frame']:.2f} s a frame"
+        f", within 0.1 dB of the best of {len(rows)}; as trained {own['psnr_full']:.2f} dB in "
+        f"{own['seconds_per_frame']:.2f} s"
+    )

@@ -3,9 +3,10 @@
 unit      what is done again and again: a frame, a step; the first one compiles
 """
 
+import contextlib
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sized
 
 from tqdm import tqdm
 
@@ -58,3 +59,10 @@ def progress(items: Iterable[T], label: str, *, quiet: bool = False, unit: str |
     for index, item in enumerate(bar):
         yield item
         estimate.tick(count - index - 1)
+
+
+@contextlib.contextmanager
+def progress_of(label: str, count: int, *, quiet: bool = False) -> Iterator[Callable[[], object]]:
+    """Context: a bar of so many steps, as a function that counts one."""
+    with tqdm(total=count, desc=label, disable=quiet, file=sys.stderr, leave=False) as bar:
+        yield bar.update

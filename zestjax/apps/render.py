@@ -7,26 +7,26 @@ import jax
 import numpy as np
 
 from zestjax.apps import results
+from zestjax.apps.budget import Budget
 from zestjax.apps.evaluate import Renderer, device_name
 from zestjax.apps.paths import camera_path
+from zestjax.apps.pilot import Pilot
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import number
 from zestjax.apps.tables import counted
 from zestjax.apps.weights import arithmetic, at_precision, open_weights, standing_still
-from zestjax.cameras import resized
 from zestjax.frames.inputs import check_target
-from zestjax.io.pictures import resize_area, to_bytes, write_image
+from zestjax.io.pictures import to_bytes, write_image
 from zestjax.io.video import write_video
 
-SCALES = (1.0, 0.75, 0.5, 0.375)
-"""Sizes that a time budget may fall back to; pictures are enlarged to the size asked for."""
 MOST_FRAMES = 10**6  # of a film that a `timing.json` is believed to tell of: 12 hours at 24 frames a second
 
 
 @dataclasses.dataclass(frozen=True)
 class RenderOptions:
-    """The flags of `zestjax render`; see the command's help. frames: of the path; budget_seconds: for all of them."""
+    """The flags of `zestjax render`; see the command's help. frames: of the path; budget_seconds: for all of them,
+    frame_ms: for each. memory: MB."""
 
     scene: str
     out: Path
@@ -36,6 +36,9 @@ class RenderOptions:
     frames: int | None = None
     size: tuple | None = None
     budget_seconds: float | None = None
+    frame_ms: float | None = None
+    at_least_db: float | None = None
+    memory: float | None = None
     format: str | None = None
     fps: float = 12.0
     still: bool = False
@@ -65,21 +68,21 @@ def _render(options):
     path = camera_path(options.path, scene.video, count=options.frames)
     size, count = scene.video.images.shape[1:3], len(path.times)
     told = {"scene": scene.name, "path": options.path, "height": size[0], "width": size[1], "frames": count}
-    each, timing = render_path(model, scene, path, budget=options.budget_seconds, quiet=options.quiet)
+    each, timing = render_path(model, scene, path, budget=Budget.of(options), quiet=options.quiet)
     pictures, seconds = [], []
     for i, (view, spent) in enumerate(each):
         if i == 0:
             results.begin(out / "timing.json", frame_names, told)
-        colour = np.clip(np.asarray(view.colour, np.float32), 0, 1)
-        pictures.append(to_bytes(resize_area(colour, *size)))
+        pictures.append(to_bytes(np.clip(np.asarray(view.colour, np.float32), 0, 1)))
         write_image(out / f"frames/{i:05d}.png", pictures[-1])
         seconds.append(spent)
     film = write_video(out / "video", np.stack(pictures), fps=options.fps)
     told |= timing(seconds) | {"video": film.name}
     results.write_record(out / "timing.json", told)
+    chosen = f"; {told['budget']['said']}" if told["budget"] else ""
     return (
         f"render: {counted(count, 'frame')} of {size[0]}x{size[1]}, {told['seconds_per_frame']:.2f} s each "
-        f"({told['seconds']:.0f} s in all): {film}"
+        f"({told['seconds']:.0f} s in all){chosen}: {film}"
     )
 
 
@@ -91,7 +94,7 @@ def frame_names(told):
 
 
 def render_path(model, scene, path, *, budget=None, quiet=False):
-    """The views along a `CameraPath`, rendered as they are taken; within `budget` seconds for all of them, if given.
+    """The views along a `CameraPath`, rendered as they are taken; within a `Budget`, if given.
 
     Returns:
       (iterator of (`View`, seconds), function of all the seconds to a dict of timing).
@@ -101,17 +104,21 @@ def render_path(model, scene, path, *, budget=None, quiet=False):
     """
     for index in range(len(path.times)):
         check_target(scene.name, scene.video, camera_at(path, index))
-    view_of, factors = _within(model, scene.video, path, budget)
-    view_at = lambda index: view_of(resized(camera_at(path, index), *factors), int(path.times[index]), ())
+    first, count = (camera_at(path, 0), int(path.times[0]), ()), len(path.times)
+    view_of = Pilot(model, scene.video, budget, count, first, quiet=quiet) if budget else Renderer(model, scene.video)
+    view_at = lambda index: view_of(camera_at(path, index), int(path.times[index]), ())
     views = (view_at(index) for index in progress(range(len(path.times)), "render", quiet=quiet, unit="frame"))
 
     def timing(seconds):
         each = float(np.median(seconds))  # the first one's compiling is not in it, if there are three
+        chosen = view_of.record if isinstance(view_of, Pilot) else None
+        before = view_of.first_seconds or 0.0
+        scale = 1.0 if chosen is None else chosen["scale"]
         return {
-            "device": device_name(), "preset": model.preset, "frames": len(seconds), "scale": number(factors[1]),
+            "device": device_name(), "preset": model.preset, "frames": len(seconds), "scale": scale,
             "seconds_per_frame": number(each), "first_frame_seconds": number(seconds[0]),
-            "prepare_seconds": number(view_of.first_seconds), "seconds": number(view_of.first_seconds + sum(seconds)),
-            "budget_seconds": budget,
+            "prepare_seconds": number(before), "seconds": number(before + sum(seconds)),
+            "budget_seconds": budget.seconds if budget else None, "budget": chosen,
         }  # fmt: skip
 
     return views, timing
@@ -120,30 +127,3 @@ def render_path(model, scene, path, *, budget=None, quiet=False):
 def camera_at(path, index):
     """One camera of a path."""
     return jax.tree.map(lambda leaf: leaf[index], path.cameras)
-
-
-def _within(model, video, path, budget):
-    """A `Renderer` at the largest scale whose frames fit the budget, and its size factors (u, v); else the smallest."""
-    view_of, factors = None, (1.0, 1.0)
-    for scale in SCALES:
-        smaller = scaled_video(video, scale)
-        height, width = (new / old for new, old in zip(smaller.images.shape[1:3], video.images.shape[1:3], strict=True))
-        view_of, factors = Renderer(model, smaller, steady=budget is not None), (width, height)
-        if budget is None:
-            break
-        _, seconds = view_of(resized(camera_at(path, 0), *factors), int(path.times[0]))
-        if seconds * len(path.times) + (view_of.prepare_seconds or 0) <= budget:
-            break
-    assert view_of is not None
-    return view_of, factors
-
-
-def scaled_video(video, scale):
-    """A video resized by area, its cameras with it."""
-    if scale == 1:
-        return video
-    have = video.images.shape[1:3]
-    size = tuple(max(1, round(side * scale)) for side in have)
-    images = np.stack([resize_area(np.asarray(image), *size) for image in video.images])
-    cameras = resized(video.cameras, size[1] / have[1], size[0] / have[0])
-    return video._replace(images=images, cameras=jax.tree.map(np.asarray, cameras))
