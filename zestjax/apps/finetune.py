@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zestjax import novel_view
+from zestjax.apps.effects import check_choice, choose, with_effects
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.own_frames import known_of, own_frame_batches
 from zestjax.apps.results import write_record
@@ -25,6 +26,7 @@ from zestjax.apps.scenes import digest, open_scene, place_of
 from zestjax.apps.train import run_name, summarise
 from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.base.parts import to_stored
+from zestjax.effects import priors_for
 from zestjax.frames.assembly import colours_of, positions
 from zestjax.frames.known import answers_of
 from zestjax.io.weights import save_weights
@@ -58,6 +60,7 @@ class FinetuneOptions:
     format: str | None = None
     resume: bool = False
     steps: int = FOREVER
+    effects: str = "all"
     seed: int = 0
     quiet: bool = False
 
@@ -72,6 +75,7 @@ def finetune(options):
     Raises:
       ValueError, WeightsError: a scene or weights that cannot be used, or no frame left to learn from.
     """
+    check_choice(options.effects)
     model = open_weights(options.weights, system=options.system)
     if getattr(model.system.static, "statistics", "batch") != "batch":
         raise ValueError("finetune: norms with stored statistics do not learn; import them with --statistics batch.")
@@ -81,10 +85,12 @@ def finetune(options):
     video = opened.scene.video
     if len(video.images) - len(set(options.exclude)) < 3:
         raise ValueError(f"finetune: --exclude leaves too few of {len(video.images)} frames; leave at least 3.")
+    chosen = choose(options.effects, opened.scene, exclude=options.exclude, quiet=options.quiet)
+    model = with_effects(model, chosen.on)
     prepared = novel_view.prepare(model.params, video, system=model.system, exclude=options.exclude)
     moving = moving_pixels(prepared)
     judges = () if moving is None else judging_frames(video, moving, options.exclude)
-    known = known_of(opened.scene)._replace(moving=moving)
+    known = priors_for(known_of(opened.scene), chosen.on)._replace(moving=moving)
     recipe = dataclasses.replace(model.recipe, rate=RATE)
     recipe = recipe.of(model.system, known=answers_of(known)) if moving is None else recipe.weighted(STILL_WEIGHTS)
     (init, step_fn), objective = recipe.trainer(steps=FOREVER), recipe.objective()
@@ -96,7 +102,7 @@ def finetune(options):
     )  # fmt: skip
     metadata = model.metadata | {
         "recipe": to_stored(recipe), "seed": options.seed, "start": run_name(model.path),
-        "scene": place_of(options.scene),
+        "scene": place_of(options.scene), "effects": list(chosen.on),
         "data": {"frames": digest(video), "exclude": list(options.exclude)},
     }  # fmt: skip
     one_at = own_frame_batches(known, recipe, seed=options.seed, exclude=options.exclude, kept=judges)

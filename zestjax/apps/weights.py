@@ -14,7 +14,6 @@ from zestjax.base.parts import from_stored, to_stored
 from zestjax.io.mvsnerf import read_mvsnerf
 from zestjax.io.weights import WeightsError, load_weights, read_metadata, save_weights
 from zestjax.losses.adversarial import DiscriminatorParams
-from zestjax.systems import presets
 from zestjax.systems.mvsnerf import MVSNERF, STATISTICS, MvsNerf
 from zestjax.systems.system import Params, System
 from zestjax.train.adversary import Opponents
@@ -162,14 +161,6 @@ def load_params(path, *, like):
 def names_of(system):
     """Function from the name of an array of 0.1 to today's."""
     return (lambda name: f".static{name}") if system == PUBLISHED else renamed
-
-
-def standing_still(model):
-    """The `Model` for a scene in which nothing moves: neither the motion volume nor the dynamic field is compiled."""
-    if model.system.dynamic is None:
-        return model
-    system, params = presets.still(model.system), model.params._replace(dynamic=None)
-    return model.running(system, params if system.frames is not None else params._replace(analysis=None))
 
 
 def at_precision(model, precision):
