@@ -249,7 +249,7 @@ def test_inspect_tells_of_a_scene_as_text_and_as_json(tmp_path, capsys):
     assert json.loads((tmp_path / "out/effects.json").read_text()) == report
     assert main(["inspect", *flags]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-1].startswith("inspect: scene is rendered without exposure, flow prior, depth prior")
+    assert lines[-1].startswith("inspect: toy is rendered without exposure, flow prior, depth prior")
     assert any(line.startswith("  motion") and "  on   yes: " in line for line in lines)
     assert main(["inspect", *flags, "--quiet"]) == 0 and not capsys.readouterr().out
     assert main(["inspect", "--scene", str(tmp_path / "nothing")]) == 2

@@ -11,7 +11,7 @@ from zestjax.effects.found import SWITCHES
 from zestjax.effects.systems import kept
 
 AUTO, ALL = "auto", "all"
-LEAST_SHARE = 0.5  # of the frames that must be left, where targets are among them, for effects to be found by
+LEAST_SHARE = 0.5  # of the frames that must be left, where some are held back, for effects to be found by
 
 
 class Chosen(NamedTuple):
@@ -38,45 +38,36 @@ def choose(choice, scene, *, exclude=(), still=False, quiet=False):
       ValueError: an unknown name.
     """
     found, seconds, without = {}, None, ("motion",) if still else ()
-    hidden = hidden_frames(scene) | set(exclude)
-    if choice == AUTO and len(hidden) > (1 - LEAST_SHARE) * len(scene.video.images):
+    if choice == AUTO and len(set(exclude)) > (1 - LEAST_SHARE) * len(scene.video.images):
         choice = ALL
         if not quiet:
-            print(
-                f"effects: {scene.name}: too many frames are targets for the rest to tell; all are on", file=sys.stderr
-            )
+            said = "too many frames are held back for the others to tell; all are on"
+            print(f"effects: {scene.name}: {said}", file=sys.stderr)
     if choice == AUTO:
         start = time.perf_counter()
-        found = inspect(scene.video, given=known_of(scene), exclude=tuple(sorted(hidden)))
+        found = inspect(scene.video, given=known_of(scene), exclude=exclude)
         seconds = time.perf_counter() - start
     on = kept(chosen(found, choice), without=without)
     off = [name for name in SWITCHES if name not in on]
     if choice == AUTO and not quiet:
         said = "; ".join(f"no {name.replace('_', ' ')} ({found[name].reason})" for name in off if name in found)
         print(f"effects: {scene.name}: {said or 'all are on'}", file=sys.stderr)
-    return Chosen(
-        on, {"choice": choice, "on": list(on), "off": off, "seconds": None if seconds is None else number(seconds)}
-    )
+    spent = None if seconds is None else number(seconds)
+    return Chosen(on, {"choice": choice, "on": list(on), "off": off, "seconds": spent})
 
 
 def hidden_frames(scene):
-    """The frames that may not be read for some target; of pictures by other cameras, which are read only when they are
-    asked for, there are none."""
+    """The frames that may not be read for some target, sorted; of pictures by other cameras, which are read only when
+    they are asked for, there are none."""
     if not len(scene.targets) or not scene.targets[0].exclude:
-        return set()
-    return {i for target in scene.targets for i in target.exclude}
+        return ()
+    return tuple(sorted({i for target in scene.targets for i in target.exclude}))
 
 
 def with_effects(model, on):
     """The `Model` run with the effects that are on; the same where all are."""
     system = system_for(model.system, on)
     return model if system == model.system else model.running(system, params_for(system, model.params))
-
-
-def recipe_with(recipe, on, *, known=None):
-    """The `Recipe` of the system with the effects that are on, as `Recipe.of`; the same where all are."""
-    system = system_for(recipe.system, on)
-    return recipe if system == recipe.system else recipe.of(system, known=known)
 
 
 def over_scenes(choice, scenes, *, quiet=False):

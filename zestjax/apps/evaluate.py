@@ -15,7 +15,7 @@ import numpy as np
 
 from zestjax import novel_view
 from zestjax.apps import results
-from zestjax.apps.effects import check_choice, choose, with_effects
+from zestjax.apps.effects import check_choice, choose, hidden_frames, with_effects
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
@@ -90,7 +90,8 @@ def evaluate_scene(model, options, out):
     """
     opened = open_scene(options.scene, model.recipe, size=options.size, protocol=options.protocol,
                         targets=options.targets, layout=options.format)  # fmt: skip
-    chosen = choose(options.effects, opened.scene, still=options.still, quiet=options.quiet)
+    hidden = hidden_frames(opened.scene)
+    chosen = choose(options.effects, opened.scene, exclude=hidden, still=options.still, quiet=options.quiet)
     view_of = Renderer(with_effects(model, chosen.on), opened.scene.video, steady=True)
     return score_scene(view_of, opened, options, out, told={"effects": chosen.told})
 

@@ -16,6 +16,7 @@ LOST = 0.1  # of a flow: there and back are off by more than 2.3 pixels, as wher
 BELIEVED = 0.5  # of a flow whose colours are compared
 SMOOTH = 9  # half-resolution pixels across: highlights are wider, noise and errors of the flow at edges are not
 HELD = 1.0  # image pixels by which the flows may leave the same still point: DIS is off by half of one
+SHADOW = 15  # half-resolution pixels across: so near to what moves, its shadow changes colours too
 LEAST_CHANGE = 0.02  # of white, of a smoothed colour: five grey levels
 SPREADS = 3.0  # standard deviations of the noise, smoothed, that a change must be above
 THIN = 9  # half-resolution pixels across: what is narrower is thin
@@ -25,7 +26,7 @@ SHIFT = 2.0  # image pixels by which its flow leaves that of what is around it: 
 # `python experiments/effects.py`.
 HIDDEN_LEAST, HIDDEN_MOST = 5e-4, 5e-3
 CHANGED_LEAST, CHANGED_MOST = 2e-3, 1e-2
-THIN_LEAST, THIN_MOST = 2e-3, 1e-2
+THIN_LEAST, THIN_MOST = 1e-3, 1e-2
 
 
 def disocclusion_evidence(looked: Looked) -> Evidence:
@@ -53,7 +54,9 @@ def _lost(pair: Pair, size):
 def view_evidence(looked: Looked, motion: Motion, near: float, far: float) -> Evidence:
     """`Evidence` of colours that change with the direction: smooth changes of what stands still, above the noise; near,
     far: world units."""
-    held = [_held(looked, k, near, far) & ~motion.moving[k] for k in range(len(looked.frames))]
+    about = np.ones((SHADOW, SHADOW), np.uint8)
+    apart = [cv2.dilate(moving.astype(np.uint8), about) == 0 for moving in motion.moving]
+    held = [_held(looked, k, near, far) & apart[k] for k in range(len(looked.frames))]
     found = [_changed(looked, pair, still) for pair, still in zip(looked.wide, held, strict=True) if pair is not None]
     shown = [each for each in found if each is not None]
     if not shown:
@@ -86,9 +89,10 @@ def _changed(looked, pair, still):
     weight = ((pair.sure > BELIEVED) & still & within(image) & within(other)).astype(np.float32)
     if weight.mean() < FEWEST_TOLD:
         return None
-    change = (other - image).mean(-1)
-    change = change - np.median(change[weight > 0])  # an exposure that is left over
-    noise = 1.4826 * np.median(np.abs(change[weight > 0]))  # a normal law's standard deviation, outliers left out
+    seen = weight > 0
+    image, other = image.mean(-1), other.mean(-1)
+    change = other / np.median(other[seen] / image[seen]) - image  # without an exposure that is left over
+    noise = 1.4826 * np.median(np.abs(change[seen]))  # a normal law's standard deviation, outliers left out
     near = cv2.blur(weight, (SMOOTH, SMOOTH))
     smooth = cv2.blur(weight * change, (SMOOTH, SMOOTH)) / np.maximum(near, 1e-6)  # a patch of nothing is left out
     limit = max(LEAST_CHANGE, SPREADS * noise / SMOOTH)
