@@ -77,7 +77,7 @@ def _prepare(commands):
 
 def _train(commands):
     command = _command(commands, "train", "scene-agnostic training", _run_train)
-    _effects_flag(command)
+    _effects_flag(command, default="all")
     command.add_argument("--preset", default="small", help="tiny, small or paper (default small)")
     command.add_argument(
         "--system", default="zest", help="zest, mvsnerf, svs, nsff, zest-geometry, zest-motion or zest-none"
@@ -108,7 +108,7 @@ def _train(commands):
 def _finetune(commands):
     command = _command(commands, "finetune", "adapts weights to one scene", _run_finetune)
     _scene_flags(command)
-    _effects_flag(command)
+    _effects_flag(command, default="all")
     command.add_argument(
         "--budget", type=positive_float, default=60.0, metavar="SECONDS", help="of stepping (default 60)"
     )
@@ -119,7 +119,7 @@ def _finetune(commands):
 def _render(commands):
     command = _command(commands, "render", "a camera path through a scene", _run_render)
     _scene_flags(command)
-    _effects_flag(command)
+    _effects_flag(command, default="auto")
     command.add_argument("--path", default="orbit", help="orbit, spiral, wander, freeze, frames, or a file")
     command.add_argument("--frames", type=positive, help="of the path (default: twice the video's)")
     command.add_argument("--budget-seconds", type=positive_float, metavar="S", help="for all frames: renders smaller")
@@ -131,7 +131,7 @@ def _render(commands):
 def _evaluate(commands):
     command = _command(commands, "evaluate", "scores against held-out truth, beside floors and ceiling", _run_evaluate)
     _scene_flags(command)
-    _effects_flag(command)
+    _effects_flag(command, default="auto")
     command.add_argument(
         "--protocol", default="held-out", help="held-out, strict, paper or fixed-view (default held-out)"
     )
@@ -210,9 +210,9 @@ def _scene_flags(command):
     command.add_argument("--system", help="refuse weights of another system")
 
 
-def _effects_flag(command):
-    command.add_argument("--effects", default="all", metavar="NAMES",
-                         help="auto (as `inspect` finds them), all (default), none, or names with commas")  # fmt: skip
+def _effects_flag(command, *, default):
+    about = f"auto (as `inspect` finds them), all, none, or names with commas (default {default})"
+    command.add_argument("--effects", default=default, metavar="NAMES", help=about)
 
 
 def _which_scene(command):

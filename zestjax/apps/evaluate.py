@@ -46,7 +46,7 @@ class EvaluateOptions:
     lpips: Path | None = None
     still: bool = False
     precision: str | None = None
-    effects: str = "all"
+    effects: str = "auto"
     seed: int = 0
     quiet: bool = False
 

@@ -41,7 +41,7 @@ class RenderOptions:
     fps: float = 12.0
     still: bool = False
     precision: str | None = None
-    effects: str = "all"
+    effects: str = "auto"
     seed: int = 0
     quiet: bool = False
 

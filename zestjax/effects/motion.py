@@ -23,9 +23,9 @@ WORSE, NOISES, CONTRASTS = 0.003, 0.5, 0.3
 SPECK = 3  # half-resolution pixels across: smaller spots are errors of the flow
 # Shares of the pixels, mean over the frames: least that is more than errors of the flow, and least that surely moves;
 # from the table of `python experiments/effects.py`.
-LEAST, MOST = 6e-4, 2e-3
-TEXTURED = 0.01  # of white: standard deviation about a pixel from which it has texture
-FEWEST_TOLD = 0.1  # share of the pixels that must have texture and a sure flow for the frames to tell
+LEAST, MOST = 3e-4, 2e-3
+TEXTURED, CLEAR = 0.01, 1.0  # of white, and of the noise of a pixel: contrast about it from which it has texture
+FEWEST_TOLD = 0.2  # share of the pixels that must have texture and a sure flow for the frames to tell
 
 
 class Motion(NamedTuple):
@@ -69,7 +69,7 @@ def _of_frame(looked, k, grid, near, far, noise):
         far_off &= (worse > WORSE + NOISES * noise) & (worse > CONTRASTS * contrast)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (SPECK, SPECK))
     moving = cv2.morphologyEx(far_off.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
-    return moving, told & (contrast > TEXTURED), gap.astype(np.float32)
+    return moving, told & (contrast > max(TEXTURED, CLEAR * noise)), gap.astype(np.float32)
 
 
 def _limit(gap, told):
