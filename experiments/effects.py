@@ -55,7 +55,7 @@ def main():
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--frames", type=int, default=8)
     options = parser.parse_args()
     keep_compiled()
     options.out.mkdir(parents=True, exist_ok=True)

@@ -20,6 +20,7 @@ FRONT = 0.05  # of a far point's depth in the other camera: nearer ones are not 
 BEHIND = 1e-9  # homogeneous depth of a point that is not in front: it lands very far away
 LEAST_SURE = 0.3  # of a flow that is believed: there and back are off by less than 1.6 pixels
 TRIED = 24  # depths that colours are compared at, beside those of the flows: most of the time goes into them
+BETWEEN = (-1 / 3, 1 / 3)  # steps of those about the best of them that are tried too
 PATCH = 5  # half-resolution pixels across whose colours are compared: a guess that was never varied
 LEAST = 1e-6  # weight of a patch that is divided by
 
@@ -107,11 +108,14 @@ def excess(compared: Compared) -> np.ndarray:
         each = (_patch_cost(compared.image, *of) for of in zip(compared.others, places, sure, strict=True))
         return sum(w * c for w, c in zip(weights, each, strict=True)) / total
 
-    own = [nearest_rho(track, there) for track, there in zip(tracks, landed, strict=True)]
+    at = lambda rho: cost([pixel_on(track, rho) for track in tracks])
+    own = [at(nearest_rho(track, there)) for track, there in zip(tracks, landed, strict=True)]
     least, most = np.max([t.least for t in tracks], axis=0), np.min([t.most for t in tracks], axis=0)
-    even = [least + share * np.maximum(most - least, 0) for share in np.linspace(0, 1, TRIED)]
-    still = np.min([cost([pixel_on(track, rho) for track in tracks]) for rho in (*own, *even)], axis=0)
-    return still - cost(landed)
+    step = np.maximum(most - least, 0) / (TRIED - 1)
+    even = np.stack([at(least + k * step) for k in range(TRIED)])
+    best = least + np.argmin(even, axis=0) * step
+    between = [at(best + share * step) for share in BETWEEN]
+    return np.min([*own, *even, *between], axis=0) - cost(landed)
 
 
 def carried(other: np.ndarray, places: np.ndarray) -> np.ndarray:
