@@ -2,8 +2,9 @@
 
 Random simulated scenes, whose truth is exact, are inspected as a user's video would be; a line of `scenes.jsonl` each,
 so that the command goes on where it was. The table then has, of each effect, how many of the scenes that have it were
-given it (found, or kept on in doubt), and how many of those that lack it. Thresholds were set with seed 0 and are
-checked with others. A scene that has only a trace of an effect counts on neither side.
+given it (found, or kept on in doubt), and how many of those that lack it. Thresholds were set on 74 clips of training
+and 142 scenes of 12 frames (`--frames 12`), and are checked on scenes of eight. A scene that has only a trace of an
+effect counts on neither side.
 """
 
 import argparse
@@ -30,7 +31,7 @@ SIDES = {
     "motion": (0.0, 2e-3),  # share of the pixels that move half a pixel a frame or more
     "disocclusion": (1e-3, 5e-3),  # share of the pixels whose point the next frame hides
     "exposure": (0.04, 0.08),  # change of a channel's gain over the video
-    "view_dependence": (1e-3, 1e-2),  # share of the pixels whose highlight changes by 2 % of white two frames later
+    "view_dependence": (5e-4, 5e-3),  # share of the pixels whose highlight changes by 2 % of white two frames later
     "noise": (0.004, 0.008),  # standard deviation, of white
     "thin_structures": (2e-3, 1e-2),  # share of the pixels of thin things, by exact depths
 }

@@ -16,17 +16,15 @@ from zestjax.effects.standing import LEAST_SURE, PATCH, Compared, excess, still_
 
 # Image pixels; or, as flow of noisy frames is off by more, times the median gap; but never more pixels than the last:
 # where everything moves, the median does.
-GAP, GAPS, MOST_GAP = 0.5, 6.0, 2.0
-# How much worse the still point must be, of white: grey levels that bytes hide, and half the noise of a pixel, of which
-# a patch has 25; and as a share of the contrast about the pixel, which an error of the depth costs a part of.
-WORSE, NOISES, CONTRASTS = 0.003, 0.5, 0.3
+GAP, GAPS, MOST_GAP = 1.0, 6.0, 2.0
+# How much worse the still point must be: of white, a grey level; and of the contrast about the pixel, of which an error
+# of the depth costs a part.
+WORSE, CONTRASTS = 0.005, 0.15
 SPECK = 3  # half-resolution pixels across: smaller spots are errors of the flow
-FEW = (
-    4  # frames from which on the one with most is left out: flow goes wrong in one frame, and what moves is in several
-)
+FEW = 4  # frames from which on the one with most is left out: flow goes wrong in one, what moves is in several
 # Shares of the pixels, mean over the frames: least that is more than errors of the flow, and least that surely moves;
 # from the table of `python experiments/effects.py`.
-LEAST, MOST = 2e-4, 2e-3
+LEAST, MOST = 3.5e-4, 4e-3
 TEXTURED, CLEAR = 0.01, 1.0  # of white, and of the noise of a pixel: contrast about it from which it has texture
 FEWEST_TOLD = 0.2  # share of the pixels that must have texture and a sure flow for the frames to tell
 
@@ -69,7 +67,7 @@ def _of_frame(looked, k, grid, near, far, noise):
     if far_off.any():
         others = [looked.images[pair.second] for pair in pairs]
         worse = excess(Compared(image, others, tracks, landed, sure))
-        far_off &= (worse > WORSE + NOISES * noise) & (worse > CONTRASTS * contrast)
+        far_off &= (worse > WORSE) & (worse > CONTRASTS * contrast)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (SPECK, SPECK))
     moving = cv2.morphologyEx(far_off.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
     return moving, told & (contrast > max(TEXTURED, CLEAR * noise)), gap.astype(np.float32)
