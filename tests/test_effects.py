@@ -11,6 +11,7 @@ import stage
 
 from zestjax import effects
 from zestjax.apps.cli import main
+from zestjax.apps.effects import choose, over_scenes
 from zestjax.cameras import Camera
 from zestjax.effects.found import EFFECTS, NO, SWITCHES, UNKNOWN, YES, Evidence, chosen, judged
 from zestjax.effects.pairs import image_pixels
@@ -22,6 +23,7 @@ from zestjax.encoding import Volume
 from zestjax.frames.analysis import without_mode
 from zestjax.frames.known import known_frames
 from zestjax.io.nsff import write_nsff
+from zestjax.io.scenes import Scene
 from zestjax.systems import presets
 from zestjax.systems.sampling import Guided
 from zestjax.video import Video
@@ -254,6 +256,23 @@ def test_inspect_tells_of_a_scene_as_text_and_as_json(tmp_path, capsys):
     assert main(["inspect", *flags, "--quiet"]) == 0 and not capsys.readouterr().out
     assert main(["inspect", "--scene", str(tmp_path / "nothing")]) == 2
     assert capsys.readouterr().err.startswith("error: ")
+
+
+def test_the_effects_of_a_command_are_those_of_its_scene(capsys):
+    still, moving = (
+        Scene(name, made(card=card), ()) for name, card in (("still", (0.0, 0.0)), ("moving", (0.0, 0.05)))
+    )
+    found = choose("auto", still)
+    assert "motion" not in found.on and found.told["off"][:1] == ["motion"] and found.told["seconds"] > 0
+    assert "effects: still: no motion (" in capsys.readouterr().err
+    assert "motion" in choose("auto", moving, quiet=True).on
+    assert "motion" not in choose("auto", moving, still=True, quiet=True).on
+    assert choose("all", still).on == EFFECTS and not choose("none", still).on and not capsys.readouterr().err
+    assert choose("auto", still, exclude=range(4)).on == EFFECTS  # two frames are left to tell
+    assert "too many frames are held back" in capsys.readouterr().err
+    on = over_scenes("auto", [still, moving], quiet=True)
+    assert "motion" in on[0] and "motion" in on[1] and "flow_prior" not in on[0]
+    assert over_scenes("auto", []) == [EFFECTS] and over_scenes("none", []) == [()]
 
 
 def test_a_wrong_effect_is_refused_before_anything_is_read(tmp_path, capsys):
