@@ -70,7 +70,7 @@ MUTATIONS = {
         ("jnp.maximum(1 / near - z * (1 / near - 1 / far), NEAREST / far)", "(1 / near - z * (1 / near - 1 / far))"),
         ("return jnp.maximum(jnp.asarray(size) - 1, 1)", "return jnp.asarray(size) - 1"),
     ],
-    "plane_statistics": [
+    "cost_volume/plane_statistics": [
         ("point = 1 / jnp.where(seen, placed.share * depth[:, None, None], 1)",
          "point = 1 / (placed.share * depth[:, None, None])"),
         ("share = weight / jnp.where(count > 0, count, 1)", "share = weight / count"),
@@ -107,8 +107,9 @@ MUTATIONS = {
 """Module: (guard, what stands in its place)."""
 
 TESTS = {
-    "plane_statistics": ["cost_volume", "trust"], "losses/means": ["losses"], "losses/regularisers": ["losses"],
-    "losses/supervision": ["losses"], "adam": ["solve"], "nets/layers": ["nets_layers"],
+    "cost_volume/plane_statistics": ["cost_volume", "trust"], "losses/means": ["losses"],
+    "losses/regularisers": ["losses"], "losses/supervision": ["losses"], "adam": ["solve"],
+    "nets/layers": ["nets_layers"],
     "fields/conditioning": ["fields"], "fields/trunk": ["fields"],
 }  # fmt: skip
 

@@ -82,7 +82,9 @@ def of_maps(folder, shown, frames, true_poses):
 
 def strict_psnr(folder, out, targets):
     """Mean PSNR of the `strict` protocol."""
-    evaluate(EvaluateOptions(str(folder), out, protocol="strict", targets=targets, pictures=False, quiet=True))
+    evaluate(
+        EvaluateOptions(str(folder), out, protocol="strict", targets=targets, pictures=False, effects="all", quiet=True)
+    )
     return read_json(out / "metrics.json")["mean"]["full"]["psnr"]
 
 

@@ -30,6 +30,7 @@ def parser():
         _evaluate,
         _frontier,
         _crossval,
+        _inspect,
         _import_mvsnerf,
         _import_lpips,
         _doctor,
@@ -76,6 +77,7 @@ def _prepare(commands):
 
 def _train(commands):
     command = _command(commands, "train", "scene-agnostic training", _run_train)
+    _effects_flag(command, default="all")
     command.add_argument("--preset", default="small", help="tiny, small or paper (default small)")
     command.add_argument(
         "--system", default="zest", help="zest, mvsnerf, svs, nsff, zest-geometry, zest-motion or zest-none"
@@ -106,6 +108,7 @@ def _train(commands):
 def _finetune(commands):
     command = _command(commands, "finetune", "adapts weights to one scene", _run_finetune)
     _scene_flags(command)
+    _effects_flag(command, default="all")
     command.add_argument(
         "--budget", type=positive_float, default=60.0, metavar="SECONDS", help="of stepping (default 60)"
     )
@@ -117,6 +120,7 @@ def _finetune(commands):
 def _render(commands):
     command = _command(commands, "render", "a camera path through a scene", _run_render)
     _scene_flags(command)
+    _effects_flag(command, default="auto")
     command.add_argument(
         "--path",
         default="orbit",
@@ -133,6 +137,7 @@ def _evaluate(commands):
     command = _command(commands, "evaluate", "scores against held-out truth, beside floors and ceiling", _run_evaluate)
     _scene_flags(command)
     _budget_flags(command)
+    _effects_flag(command, default="auto")
     command.add_argument(
         "--protocol", default="held-out", help="held-out, strict, paper or fixed-view (default held-out)"
     )
@@ -200,11 +205,31 @@ def _doctor(commands):
     command.set_defaults(run=_run_doctor)
 
 
+def _inspect(commands):
+    about = "what a scene is and which effects it calls for, with evidence"
+    command = commands.add_parser("inspect", help=about, description=about)
+    _which_scene(command)
+    command.add_argument("--json", action="store_true", help="the same as JSON")
+    command.add_argument("--out", type=Path, metavar="DIR", help="write effects.json and a picture of each effect here")
+    command.add_argument("--seed", type=natural, default=0, help="nothing here is random")
+    command.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    command.set_defaults(run=_run_inspect)
+
+
 def _scene_flags(command):
-    command.add_argument("--scene", required=True, metavar="PATH", help="a scene's folder, or bench:NAME")
-    command.add_argument("--format", metavar="NAME", help="layout of the folder (default: recognised)")
+    _which_scene(command)
     command.add_argument("--weights", type=Path, metavar="W", help="default: the shipped ones")
     command.add_argument("--system", help="refuse weights of another system")
+
+
+def _effects_flag(command, *, default):
+    about = f"auto (as `inspect` finds them), all, none, or names with commas (default {default})"
+    command.add_argument("--effects", default=default, metavar="NAMES", help=about)
+
+
+def _which_scene(command):
+    command.add_argument("--scene", required=True, metavar="PATH", help="a scene's folder, or bench:NAME")
+    command.add_argument("--format", metavar="NAME", help="layout of the folder (default: recognised)")
     command.add_argument("--size", type=size, metavar="HxW", help="default: the preset's height")
 
 
@@ -264,6 +289,12 @@ def _run_frontier(options):
     from zestjax.apps.frontier import FrontierOptions, frontier
 
     return frontier(FrontierOptions(**options)), True
+
+
+def _run_inspect(options):
+    from zestjax.apps.inspect import InspectOptions, inspect_scene
+
+    return inspect_scene(InspectOptions(**options)), True
 
 
 def _run_crossval(options):

@@ -16,11 +16,12 @@ import numpy as np
 
 from zestjax import novel_view
 from zestjax.apps import results
+from zestjax.apps.effects import check_choice, choose, hidden_frames, with_effects
 from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import mean_scores, number, score_depth, score_flow, score_image
 from zestjax.apps.tables import FLOORS, counted, headline, lacking, write_table
-from zestjax.apps.weights import arithmetic, at_precision, open_weights, standing_still
+from zestjax.apps.weights import arithmetic, at_precision, open_weights
 from zestjax.frames.between import flow_interpolation
 from zestjax.io.figures import depth_picture, error_picture, share_picture, side_by_side
 from zestjax.io.lpips import load_lpips
@@ -50,6 +51,7 @@ class EvaluateOptions:
     frame_ms: float | None = None
     at_least_db: float | None = None
     memory: float | None = None
+    effects: str = "auto"
     seed: int = 0
     quiet: bool = False
 
@@ -63,6 +65,7 @@ def evaluate(options):
     Raises:
       ValueError, WeightsError: a scene, a target or weights that cannot be used.
     """
+    check_choice(options.effects)
     model = open_weights(options.weights, system=options.system)
     model = at_precision(model, options.precision)
     with arithmetic(options.precision):
@@ -95,8 +98,10 @@ def evaluate_scene(model, options, out):
     """
     opened = open_scene(options.scene, model.recipe, size=options.size, protocol=options.protocol,
                         targets=options.targets, layout=options.format)  # fmt: skip
-    model = standing_still(model) if options.still else model
-    return score_scene(renderer_of(model, opened.scene, options), opened, options, out)
+    hidden = hidden_frames(opened.scene)
+    chosen = choose(options.effects, opened.scene, exclude=hidden, still=options.still, quiet=options.quiet)
+    view_of = renderer_of(with_effects(model, chosen.on), opened.scene, options)
+    return score_scene(view_of, opened, options, out, told={"effects": chosen.told})
 
 
 def renderer_of(model, scene, options):
@@ -112,8 +117,8 @@ def renderer_of(model, scene, options):
     )
 
 
-def score_scene(view_of, opened, options, out):
-    """Score an opened scene's targets with its `Renderer`; see `evaluate_scene`."""
+def score_scene(view_of, opened, options, out, told=None):
+    """Score an opened scene's targets with its `Renderer`; see `evaluate_scene`. told: more of metrics.json."""
     scene, model, rows = opened.scene, view_of.model, []
     lpips = None if options.lpips is None else load_lpips(options.lpips)
     given = set() if opened.ceiling is None else {"ceiling"}
@@ -129,7 +134,7 @@ def score_scene(view_of, opened, options, out):
     report = {
         "scene": scene.name, "system": model.name, "protocol": options.protocol, "height": height, "width": width,
         "preset": model.preset, "precision": model.system.precision,
-        "device": device_name(), "weights": str(model.path),
+        "device": device_name(), "weights": str(model.path), **(told or {}),
         **summary(rows), "prepare_seconds": number(view_of.prepare_seconds),
         "compile_seconds": number(view_of.compile_seconds), "budget": getattr(view_of, "record", None),
         "targets": [row["row"] for row in rows],

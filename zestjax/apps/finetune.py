@@ -19,6 +19,7 @@ import numpy as np
 
 from zestjax import novel_view
 from zestjax.apps.budget import Budget
+from zestjax.apps.effects import check_choice, choose, with_effects
 from zestjax.apps.loop import LoopOptions, run_loop
 from zestjax.apps.own_frames import known_of, own_frame_batches
 from zestjax.apps.pilot import Pilot
@@ -28,6 +29,7 @@ from zestjax.apps.settings import TRAINED
 from zestjax.apps.train import run_name, summarise
 from zestjax.apps.weights import arithmetic, open_weights
 from zestjax.base.parts import to_stored
+from zestjax.effects import priors_for
 from zestjax.frames.assembly import colours_of, positions
 from zestjax.frames.known import answers_of
 from zestjax.io.weights import save_weights
@@ -65,6 +67,7 @@ class FinetuneOptions:
     frame_ms: float | None = None
     at_least_db: float | None = None
     memory: float | None = None
+    effects: str = "all"
     seed: int = 0
     quiet: bool = False
 
@@ -79,6 +82,7 @@ def finetune(options):
     Raises:
       ValueError, WeightsError: a scene or weights that cannot be used, or no frame left to learn from.
     """
+    check_choice(options.effects)
     model = open_weights(options.weights, system=options.system)
     if getattr(model.system.static, "statistics", "batch") != "batch":
         raise ValueError("finetune: norms with stored statistics do not learn; import them with --statistics batch.")
@@ -88,11 +92,13 @@ def finetune(options):
     video = opened.scene.video
     if len(video.images) - len(set(options.exclude)) < 3:
         raise ValueError(f"finetune: --exclude leaves too few of {len(video.images)} frames; leave at least 3.")
+    chosen = choose(options.effects, opened.scene, exclude=options.exclude, quiet=options.quiet)
+    model = with_effects(model, chosen.on)
     prepared = novel_view.prepare(model.params, video, system=model.system, exclude=options.exclude)
     moving = moving_pixels(prepared)
     judges = () if moving is None else judging_frames(video, moving, options.exclude)
-    known = known_of(opened.scene)._replace(moving=moving)
-    options, chosen = within_budget(options, model, video, judges)
+    options, pilot = within_budget(options, model, video, judges)
+    known = priors_for(known_of(opened.scene), chosen.on)._replace(moving=moving)
     recipe = dataclasses.replace(model.recipe, rate=RATE)
     recipe = recipe.of(model.system, known=answers_of(known)) if moving is None else recipe.weighted(STILL_WEIGHTS)
     (init, step_fn), objective = recipe.trainer(steps=FOREVER), recipe.objective()
@@ -104,14 +110,14 @@ def finetune(options):
     )  # fmt: skip
     metadata = model.metadata | {
         "recipe": to_stored(recipe), "seed": options.seed, "start": run_name(model.path),
-        "scene": place_of(options.scene),
+        "scene": place_of(options.scene), "effects": list(chosen.on),
         "data": {"frames": digest(video), "exclude": list(options.exclude)},
     }  # fmt: skip
     one_at = own_frame_batches(known, recipe, seed=options.seed, exclude=options.exclude, kept=judges)
     batch_at = step_batches(one_at, recipe.clips)
     step_fn = jax.jit(step_fn, donate_argnums=(0, 1))
     result = run_loop(step_fn, TrainState(params, init(params), 0), batch_at, loop, metadata=metadata, explain=explain)
-    summary = _with_setting(summarise(result, options.out, "finetune"), chosen)
+    summary = _with_setting(summarise(result, options.out, "finetune"), pilot)
     if not result.finished or not judges:
         return summary
     verdict = judged(model, result.state.params, prepared, moving, judges, options.exclude)

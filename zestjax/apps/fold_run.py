@@ -160,7 +160,7 @@ def _score(place, plan, fold, weights, quiet):
     system = None if plan.steps else fold.system
     evaluate.evaluate(evaluate.EvaluateOptions(
         fold.scene, place.fold, weights, system=system, protocol=plan.protocol, size=plan.size, targets=plan.targets,
-        lpips=None if plan.lpips is None else Path(plan.lpips), seed=fold.seed, quiet=quiet,
+        lpips=None if plan.lpips is None else Path(plan.lpips), effects="all", seed=fold.seed, quiet=quiet,
     ))  # fmt: skip
 
 

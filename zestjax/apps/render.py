@@ -8,6 +8,7 @@ import numpy as np
 
 from zestjax.apps import results
 from zestjax.apps.budget import Budget
+from zestjax.apps.effects import check_choice, choose, with_effects
 from zestjax.apps.evaluate import Renderer, device_name
 from zestjax.apps.paths import camera_path
 from zestjax.apps.pilot import Pilot
@@ -15,7 +16,7 @@ from zestjax.apps.progress import progress
 from zestjax.apps.scenes import open_scene
 from zestjax.apps.scoring import number
 from zestjax.apps.tables import counted
-from zestjax.apps.weights import arithmetic, at_precision, open_weights, standing_still
+from zestjax.apps.weights import arithmetic, at_precision, open_weights
 from zestjax.frames.inputs import check_target
 from zestjax.io.pictures import to_bytes, write_image
 from zestjax.io.video import write_video
@@ -43,6 +44,7 @@ class RenderOptions:
     fps: float = 12.0
     still: bool = False
     precision: str | None = None
+    effects: str = "auto"
     seed: int = 0
     quiet: bool = False
 
@@ -61,13 +63,22 @@ def render(options):
 
 
 def _render(options):
+    check_choice(options.effects)
     model = at_precision(open_weights(options.weights, system=options.system), options.precision)
     out = Path(options.out)
     scene = open_scene(options.scene, model.recipe, size=options.size, protocol=None, layout=options.format).scene
-    model = standing_still(model) if options.still else model
+    chosen = choose(options.effects, scene, still=options.still, quiet=options.quiet)
+    model = with_effects(model, chosen.on)
     path = camera_path(options.path, scene.video, count=options.frames)
     size, count = scene.video.images.shape[1:3], len(path.times)
-    told = {"scene": scene.name, "path": options.path, "height": size[0], "width": size[1], "frames": count}
+    told = {
+        "scene": scene.name,
+        "path": options.path,
+        "height": size[0],
+        "width": size[1],
+        "frames": count,
+        "effects": chosen.told,
+    }
     each, timing = render_path(model, scene, path, budget=Budget.of(options), quiet=options.quiet)
     pictures, seconds = [], []
     for i, (view, spent) in enumerate(each):

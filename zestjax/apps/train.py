@@ -14,6 +14,7 @@ import jax
 import zestjax
 from zestjax.apps.cache import STALE_DAYS, held_clips, remove_stale_clips
 from zestjax.apps.clips import EVIDENCE, EXPOSURE, STAND_IN, ClipSpec, clip_folder, hole_key
+from zestjax.apps.effects import check_choice, over_scenes
 from zestjax.apps.hosts import is_first, join, run_mesh, run_place
 from zestjax.apps.loop import LoopOptions, LoopResult, run_loop
 from zestjax.apps.own_frames import known_of, own_frame_batches
@@ -23,9 +24,11 @@ from zestjax.apps.tables import counted
 from zestjax.apps.weights import arithmetic, load_params
 from zestjax.base.checks import check_option
 from zestjax.base.parts import to_stored
+from zestjax.effects import params_for, priors_for, system_for
 from zestjax.frames.evidence import Evidence
 from zestjax.frames.exposure import Exposure
 from zestjax.frames.known import answers_of, shared
+from zestjax.io.weights import WeightsError
 from zestjax.systems.presets import ZEST
 from zestjax.train.batches import (
     PreparedClip,
@@ -60,7 +63,7 @@ class TrainOptions:
     next. scenes: folders (or `bench:NAME`) whose own frames are predicted from one another; no simulated clips.
     checkpoint_minutes: between two checkpoints. system: one of `recipes.SYSTEMS`. stage: one of `learn.STAGES`.
     peak: highest learning rate, by default the recipe's. settings: (name, value) of `settings.with_setting` each.
-    hosts: see `hosts.join`; the devices of all processes share every step.
+    hosts: see `hosts.join`; the devices of all processes share every step. effects: of `effects.over_scenes`.
     """
 
     out: Path
@@ -84,6 +87,7 @@ class TrainOptions:
     precision: str = "float32"
     settings: tuple = ()
     hosts: str | None = None
+    effects: str = "all"
 
 
 class Summary(NamedTuple):
@@ -113,10 +117,12 @@ def train(options):
     whole = recipe_of(options.preset, system=options.system, precision=options.precision)
     whole = with_settings(whole, options.settings)
     scenes = [open_scene(name, whole, protocol=None).scene for name in options.scenes]
-    frames = shared([known_of(scene) for scene in scenes])
-    recipe = run_recipe(whole, options, known=answers_of(frames[0]) if frames else None)
+    each = over_scenes(check_choice(options.effects), scenes, quiet=options.quiet)
+    frames = shared([priors_for(known_of(scene), on) for scene, on in zip(scenes, each, strict=bool(scenes))])
+    fitted = replace(whole, system=system_for(whole.system, each[0]))
+    recipe = run_recipe(fitted, options, known=answers_of(frames[0]) if frames else None)
     metadata = run_metadata(recipe, options, frames)
-    state, step_fn = fresh(recipe, options)
+    state, step_fn = fresh(recipe, options, whole=whole)
     limit, quiet = None if options.minutes is None else 60 * options.minutes, options.quiet or not is_first()
     objective = recipe.objective()
     explain = lambda params, batch: find_fault(objective, jax.device_get(params), batch)
@@ -146,12 +152,13 @@ def run_recipe(recipe, options, *, known=None):
     return replace(recipe, rate=replace(rate, peak=options.peak, floor=options.peak * rate.floor / rate.peak))
 
 
-def fresh(recipe, options):
-    """A run's first `TrainState`, from the seed or from given weights, and its compiled step."""
+def fresh(recipe, options, whole=None):
+    """A run's first `TrainState`, from the seed or from given weights, and its compiled step. whole: the `Recipe` with
+    every effect, whose weights may be given."""
     with jax.threefry_partitionable(False):  # the other form of the same generator compiles ten times longer here
         params: Any = recipe.init(jax.random.key(options.seed))
     if options.weights is not None:
-        params = load_params(options.weights, like=params)
+        params = started(options.weights, params, recipe, recipe if whole is None else whole)
     if options.analysis is not None:
         if recipe.system.frames is None:
             raise ValueError(f"train: --analysis is of maps that `{options.system}` does not ask for; drop it.")
@@ -163,6 +170,17 @@ def fresh(recipe, options):
         init, step_fn = recipe.trainer(steps=options.steps)
         step_fn = jax.jit(step_fn, donate_argnums=(0, 1))
     return TrainState(params, init(params), 0), step_fn
+
+
+def started(path, params, recipe, whole):
+    """Given weights like `params` of a recipe, or of them what the recipe with every effect has more."""
+    if recipe.system.dynamic is whole.system.dynamic:
+        return load_params(path, like=params)
+    try:
+        every = jax.eval_shape(whole.init, jax.random.key(0))
+        return params_for(recipe.system, load_params(path, like=every))
+    except WeightsError:  # it was trained without that effect, too
+        return load_params(path, like=params)
 
 
 def say_removed(folders, options):

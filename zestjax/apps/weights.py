@@ -14,7 +14,6 @@ from zestjax.base.parts import from_stored, to_stored
 from zestjax.io.mvsnerf import read_mvsnerf
 from zestjax.io.weights import WeightsError, load_weights, read_metadata, save_weights
 from zestjax.losses.adversarial import DiscriminatorParams
-from zestjax.systems import presets
 from zestjax.systems.mvsnerf import MVSNERF, STATISTICS, MvsNerf
 from zestjax.systems.system import Params, System
 from zestjax.train.adversary import Opponents
@@ -164,14 +163,6 @@ def renewing(metadata):
         return with_paths
     name_now = (lambda name: f".static{name}") if metadata.get("system") == PUBLISHED else renamed
     return lambda arrays: with_paths({name_now(name): array for name, array in arrays.items()})
-
-
-def standing_still(model):
-    """The `Model` for a scene in which nothing moves: neither the motion volume nor the dynamic field is compiled."""
-    if model.system.dynamic is None:
-        return model
-    system, params = presets.still(model.system), model.params._replace(dynamic=None)
-    return model.running(system, params if system.frames is not None else params._replace(analysis=None))
 
 
 def at_precision(model, precision):

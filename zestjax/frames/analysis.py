@@ -35,6 +35,7 @@ STATIC_AROUND = STILL_COSTS // 2  # of the costs, the static one averaged over i
 STANDING = (0.25, 0.5)
 MOVING_PARTS = 4  # a mask value for each half-resolution pixel of a cell
 NEVER = -30.0  # logit of moving where nothing does: a probability of 1e-13, and finite
+NOWHERE = -1e9  # logit of a plane that is not looked at: finite, so that of none a softmax is even
 MOST_PLANES, MOST_WIDTH, MOST_LEVELS = 512, 4096, 8  # of a network that fits a machine, whoever wrote its file
 
 
@@ -188,6 +189,13 @@ def _mixed(standing, moved, moving):
     return jnp.logaddexp(log(standing, -moving), log(moved, moving))
 
 
+def without_mode(logits: Array, *, reach: int = 2) -> jax.Array:
+    """Logits (..., E) over planes without those within `reach` planes of the mode, for what else may be there."""
+    index = jnp.arange(logits.shape[-1]).reshape((1,) * (logits.ndim - 1) + (logits.shape[-1],))
+    mode = jnp.argmax(logits, axis=-1)[..., None]
+    return jnp.where(jnp.abs(index - mode) <= reach, jnp.asarray(NOWHERE, logits.dtype), logits)
+
+
 def plane_moments(logits: Array, *, reach: int = 2) -> tuple[jax.Array, jax.Array]:
     """Sub-plane coordinate of the mode of a distribution over planes, and its spread.
 
@@ -204,7 +212,7 @@ def plane_moments(logits: Array, *, reach: int = 2) -> tuple[jax.Array, jax.Arra
     index = jnp.arange(planes, dtype=logits.dtype).reshape((1,) * (logits.ndim - 1) + (planes,))
     mode = jax.lax.stop_gradient(jnp.argmax(logits, axis=-1).astype(logits.dtype))
     near = jnp.abs(index - mode[..., None]) <= reach
-    probability = jax.nn.softmax(jnp.where(near, logits, -1e9), axis=-1)
+    probability = jax.nn.softmax(jnp.where(near, logits, NOWHERE), axis=-1)
     mean = jnp.sum(probability * index, axis=-1)
     variance = jnp.sum(probability * (index - mean[..., None]) ** 2, axis=-1)
     whole = jax.nn.softmax(logits, axis=-1)

@@ -16,7 +16,7 @@ from zestjax.base.numerics import matvec
 from zestjax.base.parts import part
 from zestjax.base.types import Array
 from zestjax.encoding import Volume
-from zestjax.frames.analysis import plane_moments
+from zestjax.frames.analysis import plane_moments, without_mode
 from zestjax.frames.cells import nearest_cells
 from zestjax.frustum import Frustum, frustum_from_world
 from zestjax.rays import depths_from_fractions, interval_lengths, rays_from_pixels
@@ -26,6 +26,7 @@ from zestjax.video import Inputs
 FARTHEST = 1e6  # of far, as good as infinity
 BEYOND = 1.5  # of far: a point one plane past the last one lies this side of it
 UNITS = ("world", "plane", "sample")
+MOST_MODES = 8  # of a cell: a file of weights may not ask for more
 MOST_SAMPLES = 4096  # of a ray: a file of weights may not ask for more
 
 
@@ -51,14 +52,23 @@ class Sampler(Protocol):
 @part
 class Guided:
     """At the surfaces that the volumes believe in: those of a pixel's four cells and their blend. Densities are per
-    plane, and a sample stands for one."""
+    plane, and a sample stands for one. modes: surfaces that a cell is asked for, the likeliest first; two where one
+    thing hides another, and a cell may show both."""
+
+    modes: int = 1
 
     guided: ClassVar[bool] = True
     fills: ClassVar[bool] = True
 
+    def __post_init__(self):
+        check_counts("Guided", modes=(self.modes, 1, MOST_MODES))
+
     def guide(self, volumes: Sequence[Any]) -> jax.Array:
         """See `Sampler`."""
-        moments = [plane_moments(jnp.moveaxis(volume.logits, 0, -1))[0] for volume in volumes]
+        logits, moments = [jnp.moveaxis(volume.logits, 0, -1) for volume in volumes], []
+        for mode in range(self.modes):
+            logits = [without_mode(x) for x in logits] if mode else logits
+            moments += [plane_moments(x)[0] for x in logits]
         return jax.lax.stop_gradient(jnp.stack(moments))
 
     def fractions(self, guides: Array, pixels: jax.Array, jitter: jax.Array | None) -> jax.Array:

@@ -15,8 +15,8 @@ from jax import lax
 from zestjax.base.checks import check_shapes
 from zestjax.base.numerics import matvec
 from zestjax.base.types import Array
+from zestjax.cost_volume.plane_statistics import CostVolume, Sweep, plane_statistics
 from zestjax.frames.trust import Trust
-from zestjax.plane_statistics import CostVolume, Sweep, plane_statistics
 from zestjax.planesweep import sweep_grid, warp
 from zestjax.resample import bilinear
 
