@@ -134,6 +134,11 @@ def test_motion_stays_on_where_the_frames_cannot_tell():
     assert told(black) == UNKNOWN and told(black, "exposure") == UNKNOWN
     assert told(made(PLACES[:2])) == UNKNOWN  # two frames
     assert told(made(), exclude=range(1, FRAMES)) == UNKNOWN  # one is left
+    assert told(made(), exclude=(1, 3, 5)) == UNKNOWN  # none is left beside its neighbour
+    assert told(made(card=(0.03, 0.0)), exclude=(1, 4)) in (
+        UNKNOWN,
+        YES,
+    )  # 0 and 5 have no neighbour, 2 and 3 each other
     grey = made()._replace(images=np.full((FRAMES, HEIGHT, WIDTH, 3), 128, np.uint8))
     assert told(grey) == UNKNOWN
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from zestjax.effects.found import EFFECTS, Evidence, Found, unknown
 from zestjax.effects.motion import motion_evidence, motion_of
-from zestjax.effects.pairs import look
+from zestjax.effects.pairs import beside_another, look
 from zestjax.effects.recording import (
     depth_prior_evidence,
     exposure_evidence,
@@ -50,8 +50,8 @@ def inspect(
     video = check_inputs("effects.inspect", video, quantised=True)
     exclude = frozenset(check_exclude("effects.inspect", len(video.images), exclude))
     left = [i for i in range(len(video.images)) if i not in exclude]
-    if len(left) < 2:
-        return {name: unknown("fewer than two frames are left to be compared") for name in EFFECTS}
+    if not beside_another(left):
+        return {name: unknown("no two frames that follow each other are left to be compared") for name in EFFECTS}
     seen, gains = footage(video.images) if seen is None else seen, Gains()
     exposure = gains(seen, exclude=exclude)
     cameras = jax.tree.map(np.asarray, video.cameras)

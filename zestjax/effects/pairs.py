@@ -6,6 +6,7 @@ again    the pair of a frame and one taken from the same place, or nearly, some 
 wide     the pair of a frame and a later one, farther away
 """
 
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -49,19 +50,24 @@ def look(seen: Footage, cameras: Camera, size: tuple[int, int], *, excluded: fro
       seen: `Footage`, of one exposure.
       cameras: `Camera` (N, ...) on the host, of full-size images.
       size: (H, W) of the images.
-      excluded: frames that are not read.
+      excluded: frames that are not read; some frame must be left beside its neighbour, see `beside_another`.
     """
     images = np.asarray(seen.half)
     there = [i for i in range(len(images)) if i not in excluded]
-    frames = [
-        there[k] for k in np.unique(np.linspace(0, len(there) - 1, min(MOST_LOOKED, len(there))).round()).astype(int)
-    ]
+    usable = beside_another(there)
+    chosen = np.unique(np.linspace(0, len(usable) - 1, min(MOST_LOOKED, len(usable))).round()).astype(int)
+    frames = [usable[k] for k in chosen]
     places, shown = positions(cameras), as_bytes(images)
     flow, sure = seen.flow
     near = [[Pair(i, j, flow[i, s], sure[i, s]) for s, j in ((0, i + 1), (1, i - 1)) if j in there] for i in frames]
     again = [_compared(shown, i, _same_place(places, i, there)) for i in frames]
     wide = [_compared(shown, i, i + WIDE if i + WIDE in there else None) for i in frames]
     return Looked(frames, near, again, wide, images, taken(cameras, np.arange(len(images))), size)
+
+
+def beside_another(frames: Collection[int]) -> list[int]:
+    """Those of the frames whose neighbour in time is among them."""
+    return [i for i in frames if i - 1 in frames or i + 1 in frames]
 
 
 def _same_place(places, frame, there):
