@@ -32,7 +32,8 @@ FEWEST_TOLD = 0.2  # share of the pixels that must have texture and a sure flow 
 
 class Motion(NamedTuple):
     """Of every frame looked at. moving, told: (F, h, w) bool: pixels that move, and those that would tell. gap:
-    (F, h, w) image pixels, 0 where not told. once: no frame has two others to be compared with."""
+    (F, h, w) image pixels, 0 where not told. once: no frame has both its neighbours: one pair does
+    not tell motion along its epipolar line from parallax."""
 
     moving: np.ndarray
     told: np.ndarray
@@ -44,9 +45,8 @@ def motion_of(looked: Looked, near: float, far: float, *, noise: float) -> Motio
     """`Motion` of a video; near, far: world units. noise: standard deviation of a pixel, of white."""
     grid = image_pixels(*looked.images.shape[1:3])
     rows = [_of_frame(looked, k, grid, near, far, noise) for k in range(len(looked.frames))]
-    pairs = [len(around) + (again is not None) for around, again in zip(looked.near, looked.again, strict=True)]
     moving, told, gap = (np.stack(each) for each in zip(*rows, strict=True))
-    return Motion(moving, told, gap, max(pairs) < 2)
+    return Motion(moving, told, gap, max(map(len, looked.near)) < 2)
 
 
 def _of_frame(looked, k, grid, near, far, noise):
@@ -120,7 +120,7 @@ def _verdict(share, told, once):
             f"{share:.2%} of the pixels seem to move: more than errors of the flow are, less than surely move",
         )
     if once:
-        return UNKNOWN, "two frames alone do not tell what moves along its epipolar line"
+        return UNKNOWN, "no frame has both its neighbours, and two alone do not tell what moves along its epipolar line"
     return NO, f"{share:.3%} of the pixels seem to move, no more than errors of the flow do"
 
 
