@@ -1,6 +1,7 @@
 """Effects are found where they are, not where they are not, and in doubt they stay on."""
 
 import dataclasses
+import functools
 import json
 
 import jax
@@ -68,7 +69,7 @@ def made(places=PLACES, *, card=(0.0, 0.0), wall=(0.0, 0.0), gain=0.0, noise=0.0
 
 
 def told(video, name="motion", **options):
-    found = effects.inspect(video, **options)
+    found = effects.inspect(video, **({"smallest": 0} | options))
     assert set(found) == set(EFFECTS)
     json.dumps(effects.as_told(found), allow_nan=False)
     return found[name].told
@@ -133,6 +134,7 @@ def test_motion_stays_on_where_the_frames_cannot_tell():
     black = made()._replace(images=np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8))
     assert told(black) == UNKNOWN and told(black, "exposure") == UNKNOWN
     assert told(made(PLACES[:2])) == UNKNOWN  # two frames
+    assert told(made()) == NO and told(made(), smallest=HEIGHT + 1) == UNKNOWN  # too small for what is slow
     assert told(made(), exclude=range(1, FRAMES)) == UNKNOWN  # one is left
     assert told(made(), exclude=(1, 3, 5)) == UNKNOWN  # none is left beside its neighbour
     assert told(made(card=(0.03, 0.0)), exclude=(1, 4)) in (
@@ -263,7 +265,8 @@ def test_inspect_tells_of_a_scene_as_text_and_as_json(tmp_path, capsys):
     assert capsys.readouterr().err.startswith("error: ")
 
 
-def test_the_effects_of_a_command_are_those_of_its_scene(capsys):
+def test_the_effects_of_a_command_are_those_of_its_scene(capsys, monkeypatch):
+    monkeypatch.setattr("zestjax.apps.effects.inspect", functools.partial(effects.inspect, smallest=0))
     still, moving = (
         Scene(name, made(card=card), ()) for name, card in (("still", (0.0, 0.0)), ("moving", (0.0, 0.05)))
     )

@@ -44,6 +44,8 @@ class Pilot:
         self._make = renderer_of or Renderers(model, video)
         self.growth, self.shown, self.switches, self.since = area_of(self.frontier, video), [], 0, 0
         start = time.perf_counter()
+        if not quiet:
+            print(f"budget: up to {TRIES} settings are compiled and timed before the first frame", file=sys.stderr)
         self.held, self.level = held_megabytes() or 0.0, self._level(video)
         self.renderer, self.choice = self._settled()
         self.calibration_seconds = time.perf_counter() - start
@@ -97,7 +99,7 @@ class Pilot:
 
     def _say(self):
         if not self.quiet:
-            print(f"budget: {self.line}", file=sys.stderr)
+            print(f"budget: {self.line} (timed in {self.calibration_seconds:.0f} s)", file=sys.stderr)
 
     def _level(self, video):
         """Decibels as trained: of the frontier's scenes, or of this one, by frames predicted without themselves."""

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from zestjax.effects.found import EFFECTS, Evidence, Found, unknown
-from zestjax.effects.motion import motion_evidence, motion_of
+from zestjax.effects.motion import LEAST_SIDE, motion_evidence, motion_of
 from zestjax.effects.pairs import beside_another, look
 from zestjax.effects.recording import (
     depth_prior_evidence,
@@ -30,7 +30,12 @@ from zestjax.video import Video
 
 
 def inspect(
-    video: Video, *, seen: Footage | None = None, given: KnownFrames | None = None, exclude: Collection[int] = ()
+    video: Video,
+    *,
+    seen: Footage | None = None,
+    given: KnownFrames | None = None,
+    exclude: Collection[int] = (),
+    smallest: int = LEAST_SIDE,
 ) -> Found:
     """What a scene calls for.
 
@@ -39,6 +44,7 @@ def inspect(
       seen: `Footage` of it, where it is there already.
       given: priors of the scene's files, or None.
       exclude: see the header.
+      smallest: pixels of a frame's shorter side below which nothing is said to stand still.
 
     Returns:
       `Evidence` of every effect of `found.EFFECTS`. It has an answer for every video that can be rendered: where the
@@ -64,7 +70,7 @@ def inspect(
         jax.tree.map(lambda leaf: leaf[left], cameras),
     )
     found: dict[str, Evidence] = {
-        "motion": motion_evidence(motion, looked),
+        "motion": motion_evidence(motion, looked, smallest=smallest),
         "disocclusion": disocclusion_evidence(looked),
         "exposure": exposure_evidence(exposure, gains),
         "flow_prior": flow_prior_evidence(looked, given),
