@@ -7,6 +7,7 @@ more training of both fields made what stands still better and what moves worse.
 """
 
 import argparse
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -14,7 +15,9 @@ import numpy as np
 
 from zestjax.apps.train import run_name
 from zestjax.apps.weights import open_weights
+from zestjax.base.parts import to_stored
 from zestjax.io.weights import save_weights
+from zestjax.train.recipes import RECIPES
 
 
 def joined(still, moving, out):
@@ -29,7 +32,8 @@ def joined(still, moving, out):
     pairs = zip(*(jax.tree.leaves(model.params.analysis) for model in (first, second)), strict=True)
     if not all(np.array_equal(a, b) for a, b in pairs):
         raise ValueError(f"{moving}: what its frames say of themselves is not as in {still}; train one from the other.")
-    metadata = first.metadata | {"dynamic": run_name(moving)}
+    recipe = dataclasses.replace(RECIPES[first.preset], system=first.system)  # not of the last stage alone
+    metadata = first.metadata | {"dynamic": run_name(moving), "recipe": to_stored(recipe)}
     save_weights(out, first.params._replace(dynamic=second.params.dynamic), metadata=metadata)
 
 

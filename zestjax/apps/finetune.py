@@ -101,8 +101,7 @@ def finetune(options):
     known = priors_for(known_of(opened.scene), chosen.on)._replace(moving=moving)
     recipe = dataclasses.replace(model.recipe, rate=RATE)
     recipe = recipe.of(model.system, known=answers_of(known)) if moving is None else recipe.weighted(STILL_WEIGHTS)
-    (init, step_fn), objective = recipe.trainer(steps=FOREVER), recipe.objective()
-    explain = functools.partial(find_fault, objective)
+    (init, step_fn), explain = recipe.trainer(steps=FOREVER), functools.partial(find_fault, recipe.objective())
     params = jax.tree.map(jnp.array, model.trained)  # copies: the step donates
     loop = LoopOptions(
         options.out, options.steps, options.budget, options.resume, CHECKPOINT_SECONDS, quiet=options.quiet,

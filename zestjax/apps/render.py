@@ -67,18 +67,16 @@ def _render(options):
     model = at_precision(open_weights(options.weights, system=options.system), options.precision)
     out = Path(options.out)
     scene = open_scene(options.scene, model.recipe, size=options.size, protocol=None, layout=options.format).scene
+    path = camera_path(options.path, scene.video, count=options.frames)
+    for index in range(len(path.times)):  # before the frames are looked at
+        check_target(scene.name, scene.video, camera_at(path, index))
     chosen = choose(options.effects, scene, still=options.still, quiet=options.quiet)
     model = with_effects(model, chosen.on)
-    path = camera_path(options.path, scene.video, count=options.frames)
     size, count = scene.video.images.shape[1:3], len(path.times)
     told = {
-        "scene": scene.name,
-        "path": options.path,
-        "height": size[0],
-        "width": size[1],
-        "frames": count,
+        "scene": scene.name, "path": options.path, "height": size[0], "width": size[1], "frames": count,
         "effects": chosen.told,
-    }
+    }  # fmt: skip
     each, timing = render_path(model, scene, path, budget=Budget.of(options), quiet=options.quiet)
     pictures, seconds = [], []
     for i, (view, spent) in enumerate(each):
