@@ -359,16 +359,8 @@ def positive(text):
 
 def megabytes(text):
     """MB of a size with its unit."""
-    units = {
-        "B": 1e-6,
-        "KB": 1e-3,
-        "MB": 1.0,
-        "GB": 1e3,
-        "TB": 1e6,
-        "KIB": 1.024e-3,
-        "MIB": 1.048576,
-        "GIB": 1073.741824,
-    }
+    units = {"B": 1e-6, "KB": 1e-3, "MB": 1.0, "GB": 1e3, "TB": 1e6}
+    units |= {"KIB": 1024e-6, "MIB": 1024**2 / 1e6, "GIB": 1024**3 / 1e6}
     match = re.fullmatch(r"(\d+(?:\.\d*)?)\s*([a-zA-Z]+)", text)
     if not match or match[2].upper() not in units or not 0 < float(match[1]) < float("inf"):
         raise argparse.ArgumentTypeError(f"{text!r} is no size of memory: give one with its unit, as 800MB or 1.5GB")

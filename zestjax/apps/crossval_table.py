@@ -11,18 +11,16 @@ import io
 from pathlib import Path
 
 import numpy as np
-from scipy.special import stdtrit
 
 from zestjax.apps.fold_state import Place, finished
 from zestjax.apps.results import read_record, write_record
-from zestjax.apps.scoring import REGIONS, number
+from zestjax.apps.scoring import REGIONS, half_width, number
 from zestjax.apps.tables import counted
 from zestjax.io.files import write_bytes
 
 METRICS = ("psnr", "ssim", "lpips")
 DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3, "seconds": 2}
 SHOWN = (("full", "psnr"), ("full", "ssim"), ("full", "lpips"), ("dynamic", "psnr"), ("static", "psnr"))
-CONFIDENCE = 0.95
 
 
 def interval(values):
@@ -30,9 +28,7 @@ def interval(values):
     values = np.asarray([value for value in values if value is not None], np.float64)
     if not len(values):
         return None
-    half = None
-    if len(values) > 1:
-        half = stdtrit(len(values) - 1, (1 + CONFIDENCE) / 2) * values.std(ddof=1) / np.sqrt(len(values))
+    half = half_width(values)
     low, high = (None, None) if half is None else (number(values.mean() - half), number(values.mean() + half))
     return {"mean": number(values.mean()), "low": low, "high": high, "n": len(values)}
 

@@ -5,7 +5,6 @@ The page needs nothing but itself: pictures and script are in it, and it asks no
 row      dict of a setting, as `frontier.rows_of` has it
 """
 
-import base64
 import html
 import re
 from pathlib import Path
@@ -13,17 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zestjax.apps import pages
+from zestjax.apps.pages import embedded, table
 from zestjax.apps.scoring import REGIONS
-from zestjax.io.files import write_bytes
 
 WIDTH, HEIGHT, LEFT, BELOW = 860, 420, 60, 45  # of the plot and its margins, pixels
 ROUND = (1, 2, 5)  # what the ticks of seconds begin with
 STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
-h1, h2 { line-height: 1.2 } table { border-collapse: collapse; font-size: .85rem }
-p.small { color: #666; font-size: .9rem }
-th, td { padding: .2rem .5rem; text-align: right; border-bottom: 1px solid #ddd }
-td:first-child { text-align: left; white-space: nowrap }
+body { max-width: 62rem } table { font-size: .85rem } th, td { padding: .2rem .5rem }
+td:first-child { white-space: nowrap }
 tr.front { font-weight: 600 } svg { max-width: 100%; font: 12px system-ui, sans-serif } svg .grid { stroke: #eee }
 svg .front { fill: #1769aa } svg .other { fill: #aaa } svg .bar { stroke: #9bb; } svg circle:hover { stroke: #000 }
 svg .line { fill: none; stroke: #1769aa; stroke-width: 2 } .scroll { overflow-x: auto }
@@ -80,16 +77,9 @@ def write_page(out: Path, rows, *, title: str, told: str, shown=(), truth: bytes
     parts = [
         f"<h1>What accuracy costs: {html.escape(title)}</h1>", f"<p>{quoted(told)}.</p>", _plot(rows),
         f'<p class="small">{about}</p>', _budgets(shown, truth), "<h2>One change at a time</h2>", _changes(rows),
-        "<h2>All settings</h2>", _table(rows),
+        "<h2>All settings</h2>", _table(rows), f'<div id="tip"></div><script>{SCRIPT}</script>',
     ]  # fmt: skip
-    page = (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>zestjax frontier</title>'
-        f'<style>{STYLE}</style></head><body>{"".join(parts)}<div id="tip"></div>'
-        f"<script>{SCRIPT}</script></body></html>\n"
-    )
-    path = Path(out) / "report.html"
-    write_bytes(path, page.encode())
-    return path
+    return pages.write_page(Path(out) / "report.html", "zestjax frontier", parts, style=STYLE)
 
 
 def quoted(text: str) -> str:
@@ -153,10 +143,9 @@ def _budgets(shown, truth):
     """Pictures side by side, each covered by the truth from where the slider stands."""
     if not shown or truth is None:
         return ""
-    uri = lambda png: f"data:image/png;base64,{base64.b64encode(png).decode()}"
     figure = lambda s: (
-        f'<figure><div class="pair"><img src="{uri(s.png)}" alt="{html.escape(s.caption, quote=True)}">'
-        f'<img class="truth" src="{uri(truth)}" alt="truth"></div>'
+        f'<figure><div class="pair"><img src="{embedded(s.png)}" alt="{html.escape(s.caption, quote=True)}">'
+        f'<img class="truth" src="{embedded(truth)}" alt="truth"></div>'
         f"<figcaption>{html.escape(s.caption)}</figcaption></figure>"
     )
     return (
@@ -180,7 +169,7 @@ def _changes(rows):
             shown(gain("psnr_dynamic")), shown(gain("psnr_static")),
             f"{row['seconds_per_frame'] / own['seconds_per_frame']:.2f}", str(row["targets"]),
         ])  # fmt: skip
-    return _rows(head, lines)
+    return _scrolled(table(head, lines))
 
 
 def _table(rows):
@@ -191,15 +180,10 @@ def _table(rows):
     forms |= {"depth_abs_rel": ".4f", "seconds_per_frame": ".3f", "working_mb": ".0f", "joules_per_frame": ".1f"}
     cell = lambda row, name: "n/a" if row[name] is None else format(row[name], forms[name])
     lines = [[html.escape(row["setting"]), *(cell(row, name) for name in forms), str(row["targets"])] for row in rows]
-    return _rows(head, lines, marked=[bool(row["pareto"]) for row in rows])
+    best = [i for i, row in enumerate(rows) if row["pareto"]]
+    return _scrolled(table(head, lines, marked=best, mark="front"))
 
 
-def _rows(head, lines, *, marked=None):
-    """An HTML table; cells are trusted markup."""
-    marked = [False] * len(lines) if marked is None else marked
-    body = [
-        f"<tr{' class=front' if mark else ''}>" + "".join(f"<td>{cell}</td>" for cell in line) + "</tr>"
-        for line, mark in zip(lines, marked, strict=True)
-    ]
-    top = "".join(f"<th>{cell}</th>" for cell in head)
-    return f'<div class="scroll"><table><tr>{top}</tr>{"".join(body)}</table></div>'
+def _scrolled(shown):
+    """A table that may be wider than the page."""
+    return f'<div class="scroll">{shown}</div>'

@@ -1,7 +1,11 @@
 """How good a video's views are, told by its own frames: each predicted without itself."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+from zestjax.frames.assembly import colours_of
+from zestjax.metrics import psnr
 
 FRAMES = 2  # each costs as much as three views: what other frames say of it is found anew
 
@@ -14,8 +18,6 @@ def own_psnr(view_of, video, *, exclude=()) -> float:
     for i in (usable[place] for place in places):
         camera = jax.tree.map(lambda leaf, i=i: leaf[i], video.cameras)
         view, _ = view_of(camera, i, (*exclude, i))
-        truth = np.asarray(video.images[i], np.float32)
-        truth = truth / 255 if np.asarray(video.images).dtype == np.uint8 else truth
-        error = np.mean((np.clip(np.asarray(view.colour, np.float32), 0, 1) - truth) ** 2)
-        scores.append(-10 * np.log10(max(error, 1e-10)))
+        truth = colours_of(jnp.asarray(video.images[i]))
+        scores.append(psnr(jnp.clip(jnp.asarray(view.colour, jnp.float32), 0, 1), truth))
     return float(np.mean(scores))

@@ -1,11 +1,11 @@
 """What `prepare` found, and what of it is in doubt: `quality.json` for programs, `quality.html` for people."""
 
-import base64
 import html
 import json
 
 import numpy as np
 
+from zestjax.apps.pages import embedded, write_page
 from zestjax.apps.report import STYLE
 from zestjax.io.figures import png_of, side_by_side
 from zestjax.io.files import write_bytes
@@ -208,15 +208,11 @@ def write_quality(folder, report, images, moving, cameras):
         _picture(png_of(_plots(report, cameras)), "path, errors and moving share by frame"),
         "<h2>What moves, in red</h2>", _picture(encoded_png(_sheet(images, moving)), "frames with masks"),
     ]  # fmt: skip
-    page = (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>zestjax prepare</title>'
-        f"<style>{STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
-    )
-    write_bytes(folder / "quality.html", page.encode())
+    write_page(folder / "quality.html", "zestjax prepare", parts, style=STYLE)
 
 
 def _picture(png, alt):
-    return f'<img src="data:image/png;base64,{base64.b64encode(png).decode()}" alt="{alt}">'
+    return f'<img src="{embedded(png)}" alt="{alt}">'
 
 
 def _sheet(images, moving):

@@ -107,12 +107,7 @@ def render_path(model, scene, path, *, budget=None, quiet=False):
 
     Returns:
       (iterator of (`View`, seconds), function of all the seconds to a dict of timing).
-
-    Raises:
-      ValueError: a camera that sees nothing of what the inputs see.
     """
-    for index in range(len(path.times)):
-        check_target(scene.name, scene.video, camera_at(path, index))
     first, count = (camera_at(path, 0), int(path.times[0]), ()), len(path.times)
     view_of = Pilot(model, scene.video, budget, count, first, quiet=quiet) if budget else Renderer(model, scene.video)
     view_at = lambda index: view_of(camera_at(path, index), int(path.times[index]), ())

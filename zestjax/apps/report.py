@@ -3,14 +3,12 @@
 import html
 from pathlib import Path
 
+from zestjax.apps.pages import table, write_page
 from zestjax.apps.scoring import REGIONS, better_floor, share_of_the_way
-from zestjax.io.files import write_bytes
 
 STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
-h1, h2 { line-height: 1.2 } img, video { max-width: 100%; image-rendering: pixelated } video { width: 32rem }
-table { border-collapse: collapse } th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #ddd }
-th:first-child, td:first-child { text-align: left } .ours { font-weight: 600 } p.small { color: #666; font-size: .9rem }
+body { max-width: 60rem } img, video { max-width: 100%; image-rendering: pixelated } video { width: 32rem }
+th, td { padding: .25rem .7rem } th:first-child { text-align: left } .ours { font-weight: 600 }
 """
 
 
@@ -36,13 +34,7 @@ def write_report(out, report, film):
         "<h2>A real stereo pair with true disparity</h2>", f'<img src="{stereo["picture"]}" alt="stereo pair">',
         _stereo(stereo),
     ]  # fmt: skip
-    page = (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>zestjax demo</title><style>{STYLE}</style>'
-        f"</head><body>{''.join(parts)}</body></html>\n"
-    )
-    path = Path(out) / "report.html"
-    write_bytes(path, page.encode())
-    return path
+    return write_page(Path(out) / "report.html", "zestjax demo", parts, style=STYLE)
 
 
 def _film(film):
@@ -63,9 +55,9 @@ def _scores(report):
     cells = lambda scores: [
         f"{scores[r]['psnr']:.2f} / {scores[r]['ssim']:.3f}" if scores and scores.get(r) else "–" for r in REGIONS
     ]
-    return _table(
+    return table(
         ["PSNR (dB) / SSIM", *(f"{region} pixels" for region in REGIONS)],
-        [[name, *cells(scores)] for name, scores in rows], ours=2,
+        [[name, *cells(scores)] for name, scores in rows], marked=[2], mark="ours",
     )  # fmt: skip
 
 
@@ -88,7 +80,7 @@ def _targets(report):
         link = f'<a href="{html.escape(target["file"])}">time {target["time"]}, {html.escape(target["camera"])}</a>'
         psnrs = [f"{target[r]['psnr']:.2f}" if target.get(r) else "–" for r in REGIONS]
         rows.append([link, *psnrs, f"{target['seconds']:.2f}"])
-    return _table(["target", *(f"{region} dB" for region in REGIONS), "seconds"], rows)
+    return table(["target", *(f"{region} dB" for region in REGIONS), "seconds"], rows)
 
 
 def _stereo(stereo):
@@ -100,12 +92,3 @@ def _stereo(stereo):
         f"{stereo['middle_psnr']:.2f} dB; nearest frame {floors['nearest_frame']:.2f}, plane warp "
         f"{floors['plane_warp']:.2f}. {stereo['seconds_per_frame']:.2f} s a frame.</p>"
     )
-
-
-def _table(head, rows, *, ours=None):
-    """An HTML table; cells are trusted markup."""
-    lines = ["<tr>" + "".join(f"<th>{cell}</th>" for cell in head) + "</tr>"]
-    for i, row in enumerate(rows):
-        mark = ' class="ours"' if i == ours else ""
-        lines.append(f"<tr{mark}>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>")
-    return f"<table>{''.join(lines)}</table>"

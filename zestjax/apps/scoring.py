@@ -8,12 +8,14 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import stdtrit
 
 from zestjax import metrics
 from zestjax.judge.lpips import lpips as lpips_distance
 
 REGIONS = ("full", "dynamic", "static")
 LEAST_PIXELS = 64
+CONFIDENCE = 0.95
 
 
 @jax.jit
@@ -96,6 +98,15 @@ def mean_scores(rows):
         keys = dict.fromkeys(key for row in present for key in row)
         return {key: mean_scores([row.get(key) for row in present]) for key in keys}
     return number(np.mean(present))
+
+
+def half_width(values):
+    """Half of the interval that holds the mean of all such numbers with probability `CONFIDENCE` (Student's t); None of
+    fewer than two."""
+    values = np.asarray(values, np.float64)
+    if len(values) < 2:
+        return None
+    return float(stdtrit(len(values) - 1, (1 + CONFIDENCE) / 2) * values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def better_floor(floors, region="full"):

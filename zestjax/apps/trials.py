@@ -11,18 +11,16 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from scipy import stats
 
 from zestjax.apps.energy import joules, joules_since
 from zestjax.apps.memory import held_megabytes, peak_megabytes, reset_peak
 from zestjax.apps.own import own_psnr
 from zestjax.apps.scaled import ScaledRenderer
-from zestjax.apps.scoring import REGIONS, mean_scores, number, score_depth, score_image
+from zestjax.apps.scoring import REGIONS, half_width, mean_scores, number, score_depth, score_image
 from zestjax.apps.settings import TRAINED, Setting
 from zestjax.io.files import append_bytes, write_bytes
 from zestjax.io.reading import parse_json, read_regular
 
-SURE = 0.95  # probability that an interval holds the mean of all such targets
 MOST_TRIALS = 2**26  # bytes of a file of trials: a hundred thousand lines
 
 
@@ -181,12 +179,9 @@ def own_seconds(clock, processor):
 
 
 def interval(values):
-    """(low, high) that holds the mean of all such values with probability `SURE`; both the mean of a single one."""
-    values = np.asarray(values, float)
-    if len(values) < 2:
-        return float(values.mean()), float(values.mean())
-    half = stats.t.ppf((1 + SURE) / 2, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
-    return float(values.mean() - half), float(values.mean() + half)
+    """(low, high) that holds the mean of all such values, see `scoring.half_width`; both the mean of a single one."""
+    mean, half = float(np.mean(values)), half_width(values) or 0.0
+    return mean - half, mean + half
 
 
 def _moved(mean, trained, rest, region, name):

@@ -65,10 +65,8 @@ def inspect(
     looked = look(evened(seen, exposure), cameras, size, excluded=exclude)
     near, far = float(video.near), float(video.far)
     noise = noise_evidence(np.asarray(video.images)[left])
-    motion, kept = (
-        motion_of(looked, near, far, noise=noise.numbers["noise"]),
-        jax.tree.map(lambda leaf: leaf[left], cameras),
-    )
+    motion = motion_of(looked, near, far, noise=noise.numbers["noise"])
+    kept = jax.tree.map(lambda leaf: leaf[left], cameras)
     found: dict[str, Evidence] = {
         "motion": motion_evidence(motion, looked, smallest=smallest),
         "disocclusion": disocclusion_evidence(looked),

@@ -20,6 +20,7 @@ from zestjax.cameras import Camera, resized
 from zestjax.frames.cells import SIDE
 from zestjax.frames.evidence import Along, Neighbours, cell_flow, flow_gaps
 from zestjax.planesweep import homographies, plane_depths
+from zestjax.rays import pixel_grid
 from zestjax.resample import bilinear
 
 # Of a weight from one frame to the next: with 0.7, 0.9 and 1 the depths of what moves in zest-bench are off by 0.087,
@@ -47,7 +48,7 @@ def gaps_along(cameras: Camera, beside: Neighbours, near: Scalar, far: Scalar, *
     depths = plane_depths(near, far, planes, spacing="inverse")
     flow, sure = jax.vmap(cell_flow)(beside.flow, beside.sure)
     own = jax.lax.map(lambda frame: _own(depths, frame), (cameras, beside.cameras, flow, sure))
-    grid = _cells(flow)
+    grid = pixel_grid(*flow.shape[2:4], dtype=flow.dtype)
 
     def carry(side):
         def step(state, frame):
@@ -61,13 +62,6 @@ def gaps_along(cameras: Camera, beside: Neighbours, near: Scalar, far: Scalar, *
     _, after = jax.lax.scan(carry(0), start, (own, flow, sure), reverse=True)
     _, before = jax.lax.scan(carry(1), start, (own, flow, sure))
     return _averaged(own + before + after, planes)
-
-
-def _cells(flow):
-    """(h, w, 2) column and row of each cell."""
-    height, width, dtype = flow.shape[-3], flow.shape[-2], flow.dtype
-    v, u = jnp.meshgrid(jnp.arange(height, dtype=dtype), jnp.arange(width, dtype=dtype), indexing="ij")
-    return jnp.stack([u, v], -1)
 
 
 def _own(depths, frame):

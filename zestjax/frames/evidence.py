@@ -20,6 +20,7 @@ from zestjax.base.types import Array, Scalar
 from zestjax.cameras import Camera, resized
 from zestjax.frames.cells import cell_values, pooled
 from zestjax.planesweep import homographies, plane_depths
+from zestjax.rays import pixel_grid
 from zestjax.resample import bilinear
 
 TRUNCATION = 0.15  # colour difference from which a source says only that it differs: a guess that was never varied
@@ -78,8 +79,7 @@ class Neighbours(NamedTuple):
 
 
 def _grid(height, width, dtype):
-    v, u = jnp.meshgrid(jnp.arange(height, dtype=dtype), jnp.arange(width, dtype=dtype), indexing="ij")
-    return jnp.stack([u, v, jnp.ones_like(u)], -1)
+    return jnp.concatenate([pixel_grid(height, width, dtype=dtype), jnp.ones((height, width, 1), dtype)], -1)
 
 
 def _carried(homography, grid):
